@@ -8,7 +8,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from icalib.observability.words import observe
+from icalib.observability.words import Observability, observe
+from icalib.result import Verdict
 from icalib.rig import ParameterSpec
 from icalib.rig.kinds import ALL_SPECS
 
@@ -25,23 +26,30 @@ def shared(worth: float, converged: bool = True) -> Any:
     turn of all five together, of which the guess is worth so many tolerances."""
     n = len(SENSORS)
     fixed_directions = np.append(np.ones(n), 0.0)[:, None] / np.sqrt(n)
-    spread = np.sqrt(0.01 + np.append(np.full(n, worth**2 / n), 0.0))
+    by_data, by_guess = np.full(n + 1, 0.01), np.append(np.full(n, worth**2 / n), 0.0)
     estimate = SimpleNamespace(outcome=SimpleNamespace(converged=converged))
     return cast(
         Any,
         SimpleNamespace(
-            fixed_directions=fixed_directions, spread=spread, covariance=np.diag(spread**2), estimate=estimate
+            fixed_directions=fixed_directions,
+            variances=(by_data, by_guess),
+            covariance=np.diag(by_data + by_guess),
+            estimate=estimate,
         ),
     )
 
 
-@pytest.mark.parametrize(("worth", "verdict"), [(50.0, "undetermined"), (1.0, "determined"), (10.0, "weak")])
+def verdicts_of(found: Observability) -> tuple[Verdict, ...]:
+    return found.verdicts(np.arange(len(found.spread)), found.spread)
+
+
+@pytest.mark.parametrize(("worth", "verdict"), [(50.0, "unobservable"), (1.0, "determined"), (10.0, "weak")])
 def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: str):
     """A fifth of a direction each: the share alone would let none of them be open."""
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
     found = observe(shared(worth), names, specs_of(names))
-    assert found.verdicts == (verdict,) * len(SENSORS) + ("determined",)
-    (sentence,) = found.undetermined
+    assert verdicts_of(found) == (verdict,) * len(SENSORS) + ("determined",)
+    (sentence,) = found.unobservable
     assert all(s in sentence for s in SENSORS[:4]) and "turn the rig" in sentence
 
 
@@ -50,15 +58,12 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
     for first, last in ((0.75, 0.65), (0.65, 0.75)):
         fixed_directions = np.array([first, 0.1, last])[:, None]
         found = shared(50.0)
-        found.fixed_directions, found.spread, found.covariance = (
-            fixed_directions / np.linalg.norm(fixed_directions),
-            np.full(3, 50.0),
-            np.eye(3),
-        )
-        (sentence,) = observe(found, names, specs_of(names), True).undetermined
+        found.fixed_directions = fixed_directions / np.linalg.norm(fixed_directions)
+        found.variances, found.covariance = (np.zeros(3), np.full(3, 2500.0)), np.eye(3)
+        (sentence,) = observe(found, names, specs_of(names), True).unobservable
         assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
     found.fixed_directions = np.array([0.0, 1.0, 0.0])[:, None]
-    assert observe(found, names, specs_of(names)).undetermined[0].startswith("left_cam time offset: ")
+    assert observe(found, names, specs_of(names)).unobservable[0].startswith("left_cam time offset: ")
 
 
 @pytest.mark.parametrize(
@@ -72,11 +77,25 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 )
 def test_the_missing_motion_is_that_of_the_sensor(parameter, on_wheels, has_target, advice):
     found = shared(50.0)
-    found.fixed_directions, found.spread, found.covariance = np.ones((1, 1)), np.full(1, 50.0), np.eye(1)
-    (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, has_target).undetermined
+    found.fixed_directions, found.covariance = np.ones((1, 1)), np.eye(1)
+    found.variances = np.zeros(1), np.full(1, 2500.0)
+    (sentence,) = observe(found, (parameter,), specs_of((parameter,)), on_wheels, has_target).unobservable
     assert advice in sentence
 
 
 def test_an_answer_that_did_not_converge_determines_nothing():
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
-    assert observe(shared(1.0, converged=False), names, specs_of(names)).verdicts == ("undetermined",) * 6
+    found = observe(shared(1.0, converged=False), names, specs_of(names))
+    assert verdicts_of(found) == ("unobservable",) * 5 + ("too uncertain",)
+
+
+def test_above_ten_tolerances_the_larger_part_of_the_variance_decides():
+    """By the guess a parameter is unobservable, by the data it is too uncertain; in the null space it is unobservable
+    however well the guess is known."""
+    names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
+    found = shared(50.0)
+    guess = 40.0**2 * np.ones(6)
+    found.variances = np.array([0.5, 0.9, 1.1, 100.0, 0.0, 0.0]) * guess, guess * [1.0, 1.0, 1.0, 1.0, 1.0, 1e-6]
+    found.fixed_directions = np.array([0.1, 0.1, 0.1, 0.1, 0.0, 0.98])[:, None]
+    seen = observe(found, names, specs_of(names))
+    assert verdicts_of(seen) == ("unobservable",) * 2 + ("too uncertain",) * 2 + ("unobservable",) * 2

@@ -88,8 +88,8 @@ def test_residuals_are_as_expected(found):
 
 def test_what_a_flat_floor_does_not_show_is_said(found):
     for result in found.values():
-        assert result.group("wheel0", "rotation").verdict[0] == "undetermined"
-        assert result.group("wheel0", "translation").verdict[2] == "undetermined"
+        assert result.group("wheel0", "rotation").verdict[0] == "unobservable"
+        assert result.group("wheel0", "translation").verdict[2] == "unobservable"
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from icalib.errors import EstimationError
 from icalib.export.outputs import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
@@ -117,7 +118,7 @@ def test_two_pose_sensors(robot):
     rig, measurements, simulation = without_imu(scenario)
     result = calibrate_measurements(rig, measurements)
     check_known(result, simulation, 7)
-    assert result.undetermined == ()
+    assert result.unobservable == ()
     assert np.rad2deg(result.group("slam0", "rotation").std_formal).max() < 0.05
 
 
@@ -125,10 +126,10 @@ def test_on_a_flat_floor_height_and_roll_remain_open(robot):
     rig, measurements, simulation = without_imu(robot("planar", 20.0, "w").with_sensors(mocap()))
     result = calibrate_measurements(rig, measurements)
     assert result.converged, result.status
-    assert result.group("wheel0", "rotation").verdict[0] == "undetermined"
-    assert result.group("wheel0", "translation").verdict[2] == "undetermined"
+    assert result.group("wheel0", "rotation").verdict[0] == "unobservable"
+    assert result.group("wheel0", "translation").verdict[2] == "unobservable"
     e, P = normalised(result, simulation)
-    known = [k for k, v in enumerate(sum((g.verdict for g in result.groups if g.columns), ())) if v != "undetermined"]
+    known = [k for k, v in enumerate(sum((g.verdict for g in result.groups if g.columns), ())) if v not in UNUSABLE]
     assert np.abs(e / np.sqrt(np.diag(P)))[known].max() < 4.0
 
 
@@ -171,7 +172,7 @@ def test_cameras_that_follow_points_and_wheels_on_a_floor(seed, drive):
     e, P = normalised(result, simulation)
     assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
     assert set(result.group("cam0", "intrinsics").verdict) == {"determined"}
-    assert set(result.group("wheel0", "radii").verdict) == {"undetermined" if drive == "start" else "fixed"}
+    assert set(result.group("wheel0", "radii").verdict) == {"unobservable" if drive == "start" else "fixed"}
 
 
 @pytest.mark.parametrize(

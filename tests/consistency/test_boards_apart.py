@@ -95,9 +95,9 @@ def test_two_recordings_tell_what_each_of_them_tells():
 def test_turning_about_one_axis_leaves_the_distance_along_it_open():
     scenario = boards_apart()
     result = calibrated(simulate(replace(scenario, motion=replace(scenario.motion, kind="planar")), 1))
-    assert "undetermined" in result.group("cam1", "translation").verdict
+    assert "unobservable" in result.group("cam1", "translation").verdict
     assert set(result.group("cam1", "rotation").verdict) == {"determined"}
-    assert any("cam1 translation" in words for words in result.undetermined)
+    assert any("cam1 translation" in words for words in result.unobservable)
 
 
 def test_what_cannot_be_tied_is_said():

@@ -88,11 +88,11 @@ def check(kind: str, imu: ImuQuality, seed: int, mode: str = "prior") -> None:
 def check_lever_arm(result: Calibration, simulation: Simulation, rig: Rig) -> None:
     """Open along the axis of rotation, alike for both cameras, and held there between the guesses."""
     axis = axis_in_camera(simulation, "cam0")
-    assert any("translation" in sentence for sentence in result.undetermined)
+    assert any("translation" in sentence for sentence in result.unobservable)
     moved = []
     for camera in rig.cameras:
         group = result.group(camera.name, "translation")
-        assert group.verdict[int(np.argmax(np.abs(axis)))] == "undetermined"
+        assert group.verdict[int(np.argmax(np.abs(axis)))] == "unobservable"
         moved.append((group.value - camera.translation.value) @ axis)
     # What the cameras see of each other is determined: only their common shift is held.
     assert abs(np.mean(moved)) < 1e-3
@@ -126,7 +126,7 @@ def test_no_confident_wrong_number_in_a_hundred(kind: str, imu: ImuQuality):
 def test_free_motion_leaves_nothing_open():
     simulation = simulate(moving("handheld"), 0)
     result = calibrate_measurements(rig_for(simulation.scenario), simulation.measurements)
-    assert not result.undetermined
+    assert not result.unobservable
 
 
 def test_without_a_guess_a_single_axis_is_refused_with_the_missing_motion():

@@ -1,4 +1,4 @@
-"""Where estimates begin in which undetermined directions are held."""
+"""Where estimates begin in which unobservable directions are held."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_a_flat_floor_that_the_lidar_sees(robot):
     result = calibrate_measurements(rig, simulation.measurements)
     check_upright(result, simulation)
     check_known(result, simulation)
-    assert any("lidar0 translation z with wheel0 translation z" in words for words in result.undetermined)
+    assert any("lidar0 translation z with wheel0 translation z" in words for words in result.unobservable)
     assert result.group("wheel0", "ground_height").std_formal[0] == pytest.approx(HEIGHT, rel=0.05)
 
     (lidar,), mean = rig.lidars, simulation.truth.T_imu_sensor["lidar0"][:3, 3] + [0.1, 0.1, TAPE_M]
@@ -74,7 +74,7 @@ def test_a_known_height_of_the_lidar_leaves_the_sigma_of_the_floors_height(robot
     result = calibrate_measurements(rig, simulation.measurements)
     check_known(result, simulation)
     lower = result.group("wheel0", "translation")
-    assert result.undetermined == () and lower.verdict[2] == "determined"
+    assert result.unobservable == () and lower.verdict[2] == "determined"
     assert lower.std_formal[2] == pytest.approx(HEIGHT, rel=0.05)
 
 
@@ -93,7 +93,7 @@ def test_a_level_floor_under_a_target(robot):
     result = calibrate_measurements(standing(scenario, 0, replace(LEVEL, height=height)), simulation.measurements)
     check_upright(result, simulation)
     check_known(result, simulation)
-    assert any("cam0 translation z with wheel0 translation z" in words for words in result.undetermined)
+    assert any("cam0 translation z with wheel0 translation z" in words for words in result.unobservable)
 
 
 def test_hills_are_no_plane(robot):

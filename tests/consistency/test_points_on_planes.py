@@ -60,7 +60,7 @@ def test_on_a_flat_floor_they_tie_camera_and_lidar():
     result, simulation = calibrated(scenario_of("planar", 1), 1)
     off, std = between(result, simulation)
     assert std < 2e-3 and abs(off) < 4.0 * std
-    (words,) = result.undetermined
+    (words,) = result.unobservable
     assert {"cam0 translation z", "lidar0 translation z"} == set(words.split(":")[0].split(" with "))
     (fit,) = (f for f in result.fits if f.kind == "points on planes")
     assert fit.sensor == "cam0" and fit.count > 100 and fit.unit == "m" and not_none(fit.rms) < 1.5 * RELIEF_M
@@ -69,7 +69,7 @@ def test_on_a_flat_floor_they_tie_camera_and_lidar():
 
     without, simulation = calibrated(scenario_of("planar", 1), 1, 0.0)
     assert between(without, simulation)[1] > 0.05
-    assert len(without.undetermined) == 2
+    assert len(without.unobservable) == 2
 
 
 @pytest.mark.parametrize(

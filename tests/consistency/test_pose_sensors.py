@@ -67,7 +67,7 @@ def test_without_noise_it_is_recovered(kind):
     turn, way, late = errors(result, sim.truth, "mocap0")
     assert result.converged
     assert np.abs(turn).max() < 2e-7 and np.abs(way).max() < 2e-7 and np.abs(late).max() < 2e-7
-    assert result.undetermined == ()
+    assert result.unobservable == ()
 
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
@@ -126,13 +126,13 @@ def test_planar_motion_leaves_height_open():
     scenario = alone("absolute", "planar", exact=False)
     sim = simulate(replace(scenario, duration_s=20.0), 4)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
-    assert result.undetermined
-    assert all("mocap0 translation" in s for s in result.undetermined)
+    assert result.unobservable
+    assert all("mocap0 translation" in s for s in result.unobservable)
     turn, way, late = errors(result, sim.truth, "mocap0")
     assert np.abs(way[:2]).max() < 6e-3 and np.abs(late).max() < 1e-3
     rotation, translation = result.group("mocap0", "rotation"), result.group("mocap0", "translation")
     assert (np.abs(turn) < 4.0 * rotation.std).all() and rotation.std.max() < 5e-3
-    assert translation.verdict[2] == "undetermined"
+    assert translation.verdict[2] == "unobservable"
     assert translation.std[2] == pytest.approx(0.5, rel=0.05)  # what a place that nobody guessed is worth
     assert way[2] == pytest.approx(-0.15, abs=0.01)  # held where nobody said anything: at 0
 

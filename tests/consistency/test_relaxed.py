@@ -50,5 +50,5 @@ def test_some_groups_alone_are_free_as_in_a_problem_of_their_own(estimated):
     alone = classify_directions(
         freed, replace(outcome, problem=problem, information=own.information, draws=None, workspace=None)
     )
-    assert seen.undetermined.shape[1] == alone.undetermined.shape[1] == 0
+    assert seen.unobservable.shape[1] == alone.unobservable.shape[1] == 0
     np.testing.assert_allclose(seen.data, alone.data, atol=0.02 * np.abs(alone.data).max())

@@ -10,6 +10,7 @@ import pytest
 from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.tools.montecarlo.truth import error, true_value
@@ -111,7 +112,7 @@ def check_known(result: Calibration, simulation: Simulation) -> None:
     for g in result.groups:
         true = true_value(simulation.truth, g.sensor, g.name)
         if g.columns is not None and true is not None:
-            z = np.abs(error(g.name, g.value, true) / g.std_formal)[[v != "undetermined" for v in g.verdict]]
+            z = np.abs(error(g.name, g.value, true) / g.std_formal)[[v not in UNUSABLE for v in g.verdict]]
             assert z.max(initial=0.0) < MOST_SIGMA, f"{g.sensor}.{g.name} {g.value} {true} {g.std_formal} {g.verdict}"
 
 
@@ -121,7 +122,7 @@ def check_heights(result: Calibration, simulation: Simulation, rig: Rig) -> None
     for sensor in (*rig.cameras, *rig.lidars, *rig.wheels):
         g = result.group(sensor.name, "translation")
         assert sensor.translation.value is not None
-        assert g.verdict[2] == "undetermined" and g.verdict[0] != "undetermined", f"{sensor.name} {g.verdict}"
+        assert g.verdict[2] == "unobservable" and g.verdict[0] not in UNUSABLE, f"{sensor.name} {g.verdict}"
         moved = (g.value - sensor.translation.value) @ up
         assert abs(moved) < 5e-3, f"{sensor.name} {moved}"
 
@@ -129,7 +130,7 @@ def check_heights(result: Calibration, simulation: Simulation, rig: Rig) -> None
 def check_roll(result: Calibration, rig: Rig) -> None:
     for wheels in rig.wheels:
         g = result.group(wheels.name, "rotation")
-        assert g.verdict[0] == "undetermined" and "undetermined" not in g.verdict[1:], g.verdict
+        assert g.verdict[0] == "unobservable" and not {*UNUSABLE} & {*g.verdict[1:]}, g.verdict
         assert wheels.rotation.value is not None
         assert abs(error("rotation", g.value, wheels.rotation.value)[0]) < np.deg2rad(0.5)
 
@@ -157,7 +158,7 @@ def test_a_flat_floor_with_no_guess_at_all(robot):
     check_known(result, simulation)
     wheels = result.group("wheel0", "translation")
     off = wheels.value - simulation.truth.T_imu_sensor["wheel0"][:3, 3]
-    assert abs(off[2]) > 0.3 and wheels.verdict[2] == "undetermined"
+    assert abs(off[2]) > 0.3 and wheels.verdict[2] == "unobservable"
     assert (np.abs(off) < 2.0 * wheels.std_formal).all()
 
 

@@ -16,6 +16,7 @@ from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.lidar.initialize import association_rounds
 from icalib.tools.montecarlo.truth import true_value
@@ -168,7 +169,7 @@ def test_a_corridor_is_told(drive, seconds: float, faces: list[int], known: bool
         return
     assert any("planes that lidar0 saw face two directions only, as in a corridor" in w for w in result.warnings)
     translation = result.group("lidar0", "translation")
-    sure = np.array([v != "undetermined" for v in translation.verdict])
+    sure = np.array([v not in UNUSABLE for v in translation.verdict])
     off = translation.value - simulation.truth.T_imu_sensor["lidar0"][:3, 3]
     assert (np.abs(off) < 4.0 * translation.std)[sure].all()
 

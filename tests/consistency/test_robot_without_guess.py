@@ -15,6 +15,7 @@ import pytest
 
 from icalib.errors import EstimationError
 from icalib.initialize.rig_guess import guess_of_rig
+from icalib.result.verdict import UNUSABLE
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.one_run import RunTask, run
@@ -28,9 +29,9 @@ def check(scenario: Scenario, seed: int, flat: bool) -> None:
     """All but heights over a flat floor is known, and as well as it is said to be."""
     record = run(RunTask(scenario, seed, planes="found"))
     assert not record.failure
-    assert bool(record.undetermined) == flat
-    assert all("translation z" in words for words in record.undetermined)
-    known = np.concatenate([np.array(b.verdict) != "undetermined" for b in record.blocks])
+    assert bool(record.unobservable) == flat
+    assert all("translation z" in words for words in record.unobservable)
+    known = np.concatenate([~np.isin(np.array(b.verdict), UNUSABLE) for b in record.blocks])
     found = nees([Sample(seed, record.error[known], record.covariance[np.ix_(known, known)])], 0.9999)
     assert found.consistent, found
 

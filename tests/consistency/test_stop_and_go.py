@@ -86,7 +86,7 @@ def test_without_noise_it_is_recovered(count, tmp_path):
     result = calibrate_measurements(x.rig, x.measurements)
     assert result.converged, result.status
     assert np.abs(off(result, x.T_cam_flange)[0]).max() < 1e-7
-    assert result.undetermined == ()
+    assert result.unobservable == ()
     assert set(result.group("flange", "time_offset").verdict) == {"fixed"}
     assert any("time_offset is not estimated" in words for words in result.notes)
     write_outputs(result, tmp_path)
@@ -150,7 +150,7 @@ def test_without_turns_the_lever_arm_is_open():
     result = calibrate_measurements(x.rig, x.measurements)
     e, _ = off(result, x.T_cam_flange)
     assert np.abs(e[:3]).max() < 0.02
-    assert set(result.group("flange", "translation").verdict) == {"undetermined"}
+    assert set(result.group("flange", "translation").verdict) == {"unobservable"}
 
 
 def test_about_one_axis_the_arm_along_it_is_open():
@@ -158,8 +158,8 @@ def test_about_one_axis_the_arm_along_it_is_open():
     result = calibrate_measurements(x.rig, x.measurements)
     e, _ = off(result, x.T_cam_flange)
     assert np.abs(e[:3]).max() < 0.02
-    assert "undetermined" in result.group("flange", "translation").verdict
-    assert len(result.undetermined) == 1
+    assert "unobservable" in result.group("flange", "translation").verdict
+    assert len(result.unobservable) == 1
 
 
 def test_a_wrong_pair_is_left_out():

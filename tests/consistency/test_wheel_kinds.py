@@ -9,6 +9,7 @@ import pytest
 from tests.consistency.test_robot import steady
 
 from icalib.pipeline import calibrate_measurements
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.truth import error, true_value
@@ -68,11 +69,11 @@ def test_a_straight_line_leaves_what_only_turning_shows(robot, reports, open_, k
         if g.sensor == "wheel0"
         for label, v in zip(g.labels, g.verdict, strict=True)
     }
-    assert verdicts[open_] == "undetermined" and verdicts[known] != "undetermined", verdicts
+    assert verdicts[open_] == "unobservable" and verdicts[known] not in UNUSABLE, verdicts
     words = "wheel0 " + open_.replace(".", " ").replace("_", " ")
-    assert any(words in sentence for sentence in result.undetermined), result.undetermined
+    assert any(words in sentence for sentence in result.unobservable), result.unobservable
     for g in result.groups:
         true = true_value(simulation.truth, g.sensor, g.name)
         if g.sensor == "wheel0" and true is not None:
-            z = np.abs(error(g.name, g.value, true) / g.std_formal)[[v != "undetermined" for v in g.verdict]]
+            z = np.abs(error(g.name, g.value, true) / g.std_formal)[[v not in UNUSABLE for v in g.verdict]]
             assert z.max(initial=0.0) < 4.0, f"{g.name} {g.value} {true} {g.std_formal} {g.verdict}"

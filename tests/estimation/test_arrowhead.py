@@ -153,7 +153,7 @@ def test_marginalising_in_segments_raises_where_a_keyframe_is_not_determined(mon
 
 
 @pytest.mark.parametrize("n_keyframes", [3, 8])
-def test_undetermined_directions_stay_and_the_rest_is_solved(dense, n_keyframes):
+def test_unobservable_directions_stay_and_the_rest_is_solved(dense, n_keyframes):
     """Factors see three combinations of five calibration parameters: the two others are held."""
     pieces = random_pieces(n_keyframes, 5, seed=3, calib_rank=3)
     tolerance = np.array([1.0, 0.5, 2.0, 1.0, 0.3])

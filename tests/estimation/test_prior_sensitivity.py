@@ -1,4 +1,4 @@
-"""Where undetermined directions are held, and how far that may be from the truth, against draws of guesses."""
+"""Where unobservable directions are held, and how far that may be from the truth, against draws of guesses."""
 
 from __future__ import annotations
 

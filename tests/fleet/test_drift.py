@@ -82,12 +82,12 @@ def test_when_the_first_camera_moves_the_second_is_not_blamed(results: dict[str,
     assert {x.difference.sensor for x in found.changes} == {"cam0", "cam1"} and found.sensors == ("cam0",)
 
 
-def test_what_is_undetermined_or_has_no_sigma_is_no_drift(results: dict[str, Calibration]):
+def test_what_is_unobservable_or_has_no_sigma_is_no_drift(results: dict[str, Calibration]):
     c = results["r0"]
-    far = judged(moved(c, "cam0", "rotation", np.array([0.01, 0.0, 0.0])), "cam0", "rotation", "undetermined")
+    far = judged(moved(c, "cam0", "rotation", np.array([0.01, 0.0, 0.0])), "cam0", "rotation", "unobservable")
     found = drift([c, far])
     assert found.changes == () and {x.difference.sensor for x in found.unsure} == {"cam0", "cam1"}
-    assert all("undetermined in B" in x.words for x in found.unsure)
+    assert all("unobservable or too uncertain in B" in x.words for x in found.unsure)
     edited = moved(c, "cam0", "intrinsics", np.array([20.0, 20.0, 0.0, 0.0]))  # fixed in the rig file
     (lens,) = drift([c, edited]).unsure
     assert lens.difference.what == "lens" and "no standard deviation is known" in lens.words

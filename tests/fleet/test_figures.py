@@ -47,8 +47,8 @@ def test_rotations_are_turns_about_the_sensors_axes_since_the_first():
     assert drawn["layout"]["yaxis"]["title"]["text"] == "rotation [deg]"
 
 
-def test_what_is_undetermined_is_hollow_and_has_no_bar():
-    drawn = over_time([result(1, rotation([0, 0, 0])), result(3, rotation([0, 0, 0], "undetermined"))], "cam0")
+def test_what_is_unobservable_is_hollow_and_has_no_bar():
+    drawn = over_time([result(1, rotation([0, 0, 0])), result(3, rotation([0, 0, 0], "unobservable"))], "cam0")
     x, y = drawn["data"][:2]
     assert x["marker"]["symbol"] == ["circle", "circle-open"] and x["error_y"]["array"] == [pytest.approx(0.1), 0.0]
     assert y["marker"]["symbol"] == ["circle", "circle"] and y["error_y"]["array"][1] == pytest.approx(0.2)

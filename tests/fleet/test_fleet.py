@@ -9,13 +9,13 @@ import sqlite3
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from icalib.base.result_files import COMMIT
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.result import load_calibration
+from icalib.geometry.euler import rpy, rpy_std
+from icalib.result import joint_covariance, load_calibration
 from icalib.tools.fleet import Fleet, run_fleet
 from icalib.tools.fleet import run as run_module
 from icalib.tools.fleet.record import from_json, to_json
@@ -214,9 +214,16 @@ def test_the_table_holds_every_entry_of_every_job(fleet_folder: Path, workshop):
     about = ("anton", "2026-10-08T00:00:00+00:00", "done", c.status)
     expected = zip("xyz", g.value.tolist(), g.std.tolist(), g.verdict, strict=True)
     assert rows == [(*about, entry, value, std, "m", verdict) for entry, value, std, verdict in expected]
-    turns = query(fleet_folder, "SELECT entry, value, unit FROM results WHERE job = 'berta-r0' AND block = 'rotation'")
-    R = workshop.results["r0"].group("cam0", "rotation").value
-    assert turns[2] == ("z", pytest.approx(np.arctan2(R[1, 0], R[0, 0])), "rad")
+    turns = query(
+        fleet_folder,
+        "SELECT entry, value, sigma, unit, verdict FROM results WHERE job = 'berta-r0' AND block = 'rotation' "
+        "AND sensor = 'cam0'",
+    )
+    c = workshop.results["r0"]
+    g = c.group("cam0", "rotation")
+    angles, std = rpy(g.value).tolist(), rpy_std(g.value, joint_covariance(c, [g])).tolist()
+    assert turns[:3] == [(*x, "rad", None) for x in zip(("roll", "pitch", "yaw"), angles, std, strict=True)]
+    assert turns[3:] == [(a, None, s, "rad", v) for a, s, v in zip("xyz", g.std.tolist(), g.verdict, strict=True)]
     counted = query(fleet_folder, "SELECT job, count(*) FROM results GROUP BY job ORDER BY job")
     assert [name for name, _ in counted] == NAMES and len({n for _, n in counted}) == 1
     assert ("time_offset",) in query(fleet_folder, "SELECT DISTINCT entry FROM results")
@@ -314,5 +321,5 @@ def test_what_cannot_be_judged_is_pointed_to_on_the_first_screen(fleet_folder: P
     out = capsys.readouterr().out
     assert "Cannot be judged: berta, berta-r0 to berta-r1: the lens of cam0 moved points by" in out
     page = (fleet_folder / "out" / "fleet.html").read_text()
-    assert '<a href="#facts">Cannot be judged</a>: 1 more, undetermined or typed.' in page
+    assert '<a href="#facts">Cannot be judged</a>: 1 more, not determined or typed.' in page
     assert "<li>berta, berta-r0 to berta-r1: the lens of cam0 moved points by" in page

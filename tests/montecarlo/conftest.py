@@ -36,7 +36,7 @@ def made_up(seed: int, optimism: float = 1.0) -> RunRecord:
 
 def with_verdict(record: RunRecord, key: str, verdict: tuple[str, ...]) -> RunRecord:
     blocks = tuple(replace(b, verdict=verdict) if b.key == key else b for b in record.blocks)
-    return replace(record, blocks=blocks, undetermined=("wheel0 radii left: not determined; roll on.",))
+    return replace(record, blocks=blocks, unobservable=("wheel0 radii left: not determined; roll on.",))
 
 
 @pytest.fixture

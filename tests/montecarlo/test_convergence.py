@@ -28,11 +28,11 @@ def test_first_six_good_runs_of_all_sensors_but_further_cameras(record):
     assert rows([RunRecord(0, "it broke.", 1.0, "digest")]) == ()
 
 
-def test_what_is_undetermined_has_the_bound_of_the_result(record, judged):
-    one = judged(record(0), "wheel0.radii", ("undetermined", "determined"))
+def test_what_is_unobservable_has_the_bound_of_the_result(record, judged):
+    one = judged(record(0), "wheel0.radii", ("unobservable", "determined"))
     path = tuple(replace(w, std=np.zeros(13)) for w in one.path)
     panel = rows([replace(one, path=path), record(1)])[-1].panels[0]
-    assert panel.title == "wheel0 radii left (undetermined in 1 of 2)"
+    assert panel.title == "wheel0 radii left (unobservable in 1 of 2)"
     assert panel.curves[0].bound == pytest.approx(3e3 * np.sqrt([one.covariance[11, 11]] * 2))
 
 

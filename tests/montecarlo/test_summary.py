@@ -13,7 +13,7 @@ from icalib.tools.montecarlo.page import study_html
 from icalib.tools.montecarlo.record import RunRecord, Size, from_json, to_json
 from icalib.tools.montecarlo.store import Identity
 from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.tools.montecarlo.words import answer, largest_words, undetermined_words, verdict_words
+from icalib.tools.montecarlo.words import answer, largest_words, unobservable_words, verdict_words
 
 KEYS = ("cam0.rotation", "cam0.time_offset", "cam0.distortion", "cam1.rotation", "cam1.distortion", "wheel0.radii")
 
@@ -65,25 +65,25 @@ def test_order_of_records_does_not_matter(record):
     assert consistency_json(summarise(runs[::-1]), {}) == consistency_json(summarise(runs), {})
 
 
-def test_undetermined_entries_stay_out(record: Callable[..., RunRecord], judged):
+def test_unobservable_entries_stay_out(record: Callable[..., RunRecord], judged):
     runs = [record(seed) for seed in range(30)]
     spoilt = [replace(r, error=r.error * np.r_[np.ones(11), 1e6, 1.0]) for r in runs]
-    found = summarise([judged(r, "wheel0.radii", ("undetermined", "weak")) for r in spoilt])
+    found = summarise([judged(r, "wheel0.radii", ("unobservable", "weak")) for r in spoilt])
     radii = block(found, "wheel0.radii")
     alone = [(r.error[12] ** 2, r.covariance[12, 12]) for r in runs]
     assert radii.dimension == 1
     assert radii.nees is not None and radii.nees.mean == pytest.approx(np.mean([e / v for e, v in alone]))
     assert radii.rmse == pytest.approx(np.sqrt(np.mean([e for e, _ in alone])))
     assert radii.entries[0].runs == 0 and radii.entries[0].rmse is None
-    assert radii.entries[0].verdicts == {"undetermined": 30}
-    assert found.undetermined == {"wheel0 radii left": 30}
-    assert undetermined_words(found) == ["30 of 30 runs: wheel0 radii left"]
-    assert verdict_words(radii) == "left: 30 undetermined; right: 30 weak"
+    assert radii.entries[0].verdicts == {"unobservable": 30}
+    assert found.unobservable == {"wheel0 radii left": 30}
+    assert unobservable_words(found) == ["30 of 30 runs: wheel0 radii left"]
+    assert verdict_words(radii) == "left: 30 unobservable; right: 30 weak"
     assert found.whole is not None and found.whole.mean < 2.0
 
 
-def test_a_block_may_be_undetermined_in_some_runs_or_all(record, judged):
-    both = ("undetermined", "undetermined")
+def test_a_block_may_be_unobservable_in_some_runs_or_all(record, judged):
+    both = ("unobservable", "unobservable")
     some = summarise([judged(record(0), "wheel0.radii", both), record(1), record(2), record(3)])
     assert block(some, "wheel0.radii").runs == 3
     none = summarise([judged(record(seed), "wheel0.radii", both) for seed in range(3)])
@@ -130,7 +130,7 @@ def test_the_largest_error_is_of_what_counts(record, judged):
     runs = [record(seed) for seed in range(20)]
     z = np.array([r.error / np.sqrt(np.diag(r.covariance)) for r in runs])
     spoilt = [replace(r, error=r.error * np.r_[np.ones(11), 1e6, 1.0]) for r in runs]
-    open_left = [judged(r, "wheel0.radii", ("undetermined", "determined")) for r in spoilt]
+    open_left = [judged(r, "wheel0.radii", ("unobservable", "determined")) for r in spoilt]
     found = summarise([*open_left, RunRecord(99, "it broke.", 1.0, "digest")])
     counted = np.abs(np.delete(z, 11, axis=1))
     assert found.largest is not None and found.largest.sigmas == pytest.approx(counted.max())
@@ -145,7 +145,7 @@ def test_the_largest_error_is_of_what_counts(record, judged):
 
 
 def test_on_the_page_each_figure_stands_under_its_heading(record, judged):
-    runs = [judged(record(seed), "wheel0.radii", ("undetermined", "weak")) for seed in range(5)]
+    runs = [judged(record(seed), "wheel0.radii", ("unobservable", "weak")) for seed in range(5)]
     page = study_html(summarise(runs), Identity("s.yaml", "0", "none", "known", "digest", {}), runs)
-    marks = ["<h2>Blocks", "The largest error of", "<h2>Mean NEES", 'id="nees"', "<h2>Undetermined", "<h2>Failed runs"]
+    marks = ["<h2>Blocks", "The largest error of", "<h2>Mean NEES", 'id="nees"', "<h2>Unobservable", "<h2>Failed runs"]
     assert [page.index(m) for m in marks] == sorted(page.index(m) for m in marks)

@@ -53,7 +53,7 @@ def errors(result: Calibration, sim: Simulation, *sizes: str) -> tuple[np.ndarra
     true = {("wheels0", name): truth.values["wheels0"][name] for name in sizes}
     true |= {("gnss0", "translation"): ON_WHEELS, ("gnss0", "time_offset"): np.array([offset])}
     error = np.concatenate([np.ravel(result.value(*key)) - value for key, value in true.items()])
-    assert result.group("gnss0", "translation").verdict[2] == "undetermined"
+    assert result.group("gnss0", "translation").verdict[2] == "unobservable"
     known = np.delete(np.arange(len(error)), len(error) - 2)  # without the height of the lever arm
     return error[known], result.covariance[np.ix_(known, known)]
 

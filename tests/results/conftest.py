@@ -64,7 +64,7 @@ def calibration() -> Calibration:
         covariance=_covariance(groups, rng),
         covariance_names=names,
         null_space=_null_space(names),
-        undetermined=("cam1 translation y: turn the rig about a second axis to determine it.",),
+        unobservable=("cam1 translation y: turn the rig about a second axis to determine it.",),
         fits=tuple(_fits()),
         residuals=by_key(
             [
@@ -144,7 +144,7 @@ def _group(before: list[ParameterGroup], sensor: str, name: str, value: object, 
     start = sum(len(g.labels) for g in before if g.columns)
     verdict: list[Verdict] = ["determined"] * n
     if (sensor, name) == ("cam1", "translation"):
-        verdict = ["determined", "undetermined", "weak"]
+        verdict = ["determined", "unobservable", "weak"]
     formal, factor = np.full(n, std) * (1.0 + 0.1 * np.arange(n)), np.full(n, 2.7)
     columns = tuple(range(start, start + n))
     return ParameterGroup(
@@ -161,7 +161,7 @@ def _covariance(groups: tuple[ParameterGroup, ...], rng: np.random.Generator) ->
 
 
 def _null_space(names: tuple[str, ...]) -> np.ndarray:
-    """(B, 1): the component that is undetermined."""
+    """(B, 1): the component that is unobservable."""
     return np.eye(len(names))[:, [names.index("cam1.translation.y")]]
 
 
@@ -273,7 +273,7 @@ def without_cameras(robot: Calibration) -> Calibration:
         null_space=np.zeros((len(columns), 0)),
         fits=tuple(f for f in robot.fits if f.sensor not in gone),
         residuals={key: r for key, r in robot.residuals.items() if key[0] not in gone},
-        undetermined=(),
+        unobservable=(),
         rig=rig,
         cross_validation=None,
     )

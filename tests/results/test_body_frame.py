@@ -62,10 +62,10 @@ def test_relative_poses_are_the_same_in_either_frame(of_cam0: Calibration):
     still, moved = found.group("cam0", "rotation"), found.group("cam1", "translation")
     assert still.columns is None and (still.value == np.eye(3)).all() and set(still.verdict) == {"fixed"}
     np.testing.assert_allclose(moved.std, of_cam0.T("cam0", "cam1").std[3:], rtol=1e-9)
-    assert "undetermined" in moved.verdict  # as that of cam1 relative to the IMU
+    assert "unobservable" in moved.verdict  # as that of cam1 relative to the IMU
 
 
-def test_poses_are_undetermined_where_the_null_space_moves_them(of_cam0: Calibration):
+def test_poses_are_unobservable_where_the_null_space_moves_them(of_cam0: Calibration):
     """Both cameras move in the IMU's frame together, so that only the IMU moves in the frame of cam0. Small standard
     deviations, as a prior gives them, do not hide it."""
     step = np.array([0.28, 0.96, 0.0])  # in the frame of cam0; squares 0.08, 0.92, 0
@@ -74,14 +74,14 @@ def test_poses_are_undetermined_where_the_null_space_moves_them(of_cam0: Calibra
         null[columns_of(of_cam0, camera)[3:], 0] = np.sqrt(0.5) * of_cam0.T_imu_sensor("cam0")[:3, :3] @ step
     small = replace(of_cam0, covariance=1e-2 * of_cam0.covariance, null_space=null)
     found = in_body_frame(small)
-    assert found.group("imu0", "translation").verdict == ("determined", "undetermined", "determined")
+    assert found.group("imu0", "translation").verdict == ("determined", "unobservable", "determined")
     for sensor, name in (("imu0", "rotation"), ("cam1", "rotation"), ("cam1", "translation")):
         assert set(found.group(sensor, name).verdict) == {"determined"}
     moved = np.zeros(len(found.covariance))
     moved[columns_of(found, "imu0")[3:]] = step
     np.testing.assert_allclose(np.abs(found.null_space.T @ moved), 1.0)
     failed = in_body_frame(replace(small, converged=False))
-    assert set(failed.group("imu0", "rotation").verdict) == {"undetermined"}
+    assert set(failed.group("imu0", "rotation").verdict) == {"too uncertain"}
 
 
 def test_without_a_body_of_its_own_nothing_changes(calibration: Calibration):

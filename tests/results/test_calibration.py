@@ -55,7 +55,7 @@ def test_yaml_is_what_the_design_says(calibration: Calibration, saved: Path):
     assert cam["parameters"]["fy"] == 456.134
     assert cam["std"]["rotation"] == calibration.group("cam1", "rotation").std.tolist()
     assert cam["std"]["parameters"]["k1"] == 0.0
-    assert cam["verdict"]["translation"] == ["determined", "undetermined", "weak"]
+    assert cam["verdict"]["translation"] == ["determined", "unobservable", "weak"]
     assert cam["verdict"]["parameters"]["k1"] == "fixed"
     assert cam["verdict"]["time_offset"] == "determined"
     assert cam["empirical_factor"]["translation"] == [2.7] * 3
@@ -130,6 +130,19 @@ def test_arrays_that_would_run_code(saved: Path):
     np.savez(saved / "result.npz", covariance=np.array([print], dtype=object))
     change(saved, npz_sha256=hashlib.sha256((saved / "result.npz").read_bytes()).hexdigest())
     assert "cannot be read" in sentence_of(saved)
+
+
+def test_results_of_format_3_have_two_words_for_undetermined(calibration: Calibration, saved: Path):
+    """What lies in the null space was at its guess; all else had a standard deviation above ten tolerances."""
+    file = saved / "result.json"
+    old = json.loads(file.read_text()) | {"format_version": 3}
+    old["undetermined"] = old.pop("unobservable")
+    (translation,) = (g for g in old["groups"] if (g["sensor"], g["name"]) == ("cam1", "translation"))
+    translation["verdict"] = ["undetermined", "undetermined", "weak"]  # y is in the null space
+    file.write_text(json.dumps(old))
+    loaded = load_calibration(saved)
+    assert loaded.group("cam1", "translation").verdict == ("too uncertain", "unobservable", "weak")
+    assert loaded.unobservable == calibration.unobservable
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_what_changed_is_said_in_words(robot: Calibration):
     assert re.search(r"DIFFERS  the right radius of wheel0 changed by \+0\.98 %, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  the lens of cam0 moved points by 1\.\d px RMS, \d\.\d px at most, \d+\.\d sigma", text)
     assert re.search(r"same     lidar0 turned by 0 deg about its x axis, 0\.0 sigma", text)
-    assert "undetermined in A and B" in sentence(only(found, "cam1", "translation", "imu0"), found)
+    assert "unobservable or too uncertain in A and B" in sentence(only(found, "cam1", "translation", "imu0"), found)
     assert re.search(r"\d+ of \d+ differ\.$", text)
 
 
@@ -418,9 +418,9 @@ def test_entries_that_say_the_same_count_once():
     assert sigmas(np.full(3, 2.0), np.ones((3, 3))) == pytest.approx(2.0, rel=1e-9)
 
 
-def test_what_is_undetermined_of_the_camera_seen_from_is_marked(robot: Calibration):
+def test_what_is_unobservable_of_the_camera_seen_from_is_marked(robot: Calibration):
     groups = tuple(
-        dataclasses.replace(g, verdict=("undetermined", "determined", "determined"))
+        dataclasses.replace(g, verdict=("unobservable", "determined", "determined"))
         if (g.sensor, g.name) == ("cam0", "rotation")
         else g
         for g in robot.groups

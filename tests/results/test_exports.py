@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from icalib.base.own_files import sealed_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.export.common import quaternion, rpy
+from icalib.export.common import guesses, quaternion
 from icalib.export.formats import export
 from icalib.export.names import FORMATS
 from icalib.geometry.cameras import camera_model
@@ -81,6 +81,19 @@ def without_imu(c: Calibration) -> Calibration:
     return dataclasses.replace(c, rig=rig, groups=tuple(g for g in c.groups if g.sensor != "imu0"))
 
 
+def test_what_is_too_uncertain_is_not_called_a_guess(robot: Calibration):
+    groups = tuple(
+        dataclasses.replace(g, verdict=("too uncertain", "unobservable", "weak"))
+        if (g.sensor, g.name) == ("cam1", "translation")
+        else g
+        for g in robot.groups
+    )
+    assert guesses(dataclasses.replace(robot, groups=groups), ("cam0", "cam1")) == (
+        "cam1: translation y is unobservable, so the value depends on the initial guess.",
+        "cam1: translation x is too uncertain, with a standard deviation above 10 tolerances.",
+    )
+
+
 @pytest.mark.parametrize("to", FORMATS)
 def test_every_format_says_which_way_its_transform_goes(robot: Calibration, to: str):
     said = {"kalibr": "takes coordinates in", "camera-info": "no pose", "json": "p_imu = T_imu_sensor p_sensor"}
@@ -92,7 +105,7 @@ def test_every_format_says_which_way_its_transform_goes(robot: Calibration, to: 
     assert any(said.get(to, "p_parent = T p_child") in text for text in found.files.values())
     # What is printed stands in the files, too: in one of them at least.
     texts = " ".join(found.files.values())
-    guessed = "cam1: translation y was not determined by the data; the file has its initial guess."
+    guessed = "cam1: translation y is unobservable, so the value depends on the initial guess."
     for sentence in found.sentences:
         assert sentence in texts or to == "json"
     assert (guessed in found.sentences) == (to not in ("camera-info", "fast-lio", "fast-livo2", "lio-sam"))
@@ -339,7 +352,7 @@ def test_plain_json(robot: Calibration):
         np.testing.assert_allclose(Rotation.from_quat(sensor["quaternion_xyzw"]).as_matrix(), T[:3, :3], atol=1e-12)
         assert sensor["translation"] == T[:3, 3].tolist()
         assert sensor["std"]["rotation"] == robot.group(name, "rotation").std.tolist()
-    assert data["sensors"]["cam1"]["verdict"]["translation"] == ["determined", "undetermined", "weak"]
+    assert data["sensors"]["cam1"]["verdict"]["translation"] == ["determined", "unobservable", "weak"]
     assert "T_lidar0_wheel0" in data["relative"]
 
 
@@ -363,7 +376,7 @@ def test_a_clock_that_restarts_has_no_offset_to_give(robot: Calibration, to: str
             value=np.array([0.01, -3.2]),
             std=np.full(2, 1e-4),
             std_formal=np.full(2, 1e-4),
-            verdict=("determined", "undetermined"),
+            verdict=("determined", "unobservable"),
             factor=np.ones(2),
         )
         groups = (*(g for g in restarting.groups if (g.sensor, g.name) != (name, "time_offset")), group)
@@ -393,18 +406,14 @@ def test_imu_intrinsics_that_have_no_place_are_said(robot: Calibration):
         assert not any("scale and misalignment" in s for s in export(c, to).sentences)
 
 
-def test_rotations_in_other_terms():
-    """Random ones, half turns, and pitch of 90 deg, where roll and yaw are one."""
+def test_quaternions_of_rotations():
+    """Random ones, half turns, and pitch of 90 deg."""
     angles = [[y, p, r] for p in (90, -90, 89.9999999) for y, r in ((30, 20), (-170, 5))]
     special = [Rotation.from_euler("ZYX", a, degrees=True) for a in angles]
     special += [Rotation.from_rotvec(np.pi * np.eye(3)[k]) for k in range(3)] + [Rotation.identity()]
     for rotation in [*special, *Rotation.random(50, rng=np.random.default_rng(1))]:
-        R = rotation.as_matrix()
-        roll, pitch, yaw = rpy(R)
-        again = Rotation.from_euler("ZYX", [yaw, pitch, roll]).as_matrix()
-        np.testing.assert_allclose(again, R, atol=1e-12)
-        x, y, z, w = quaternion(R)
-        np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), R, atol=1e-12)
+        x, y, z, w = quaternion(rotation.as_matrix())
+        np.testing.assert_allclose(Rotation.from_quat([x, y, z, w]).as_matrix(), rotation.as_matrix(), atol=1e-12)
         assert w >= 0
 
 

@@ -19,7 +19,7 @@ def test_the_repr_is_one_short_line(robot: Calibration):
     assert (
         repr(robot) == f"<Calibration of imu0, cam0, cam1, lidar0, wheel0: {robot.verdict}, 3 reasons; see .summary()>"
     )
-    good = dataclasses.replace(robot, warnings=(), undetermined=(), groups=robot.groups[:1])
+    good = dataclasses.replace(robot, warnings=(), unobservable=(), groups=robot.groups[:1])
     assert repr(good) == "<Calibration of imu0, cam0, cam1, lidar0, wheel0: usable; see .summary()>"
 
 
@@ -31,7 +31,7 @@ def test_the_summary_has_verdict_reasons_and_every_parameter(robot: Calibration)
     assert table[0].split() == ["sensor", "parameter", "value", "std", "unit", "verdict"]
     group = robot.group("cam1", "translation")
     (row,) = (line.split() for line in table if re.match(r"cam1 +translation y ", line))
-    assert row[-1] == "undetermined" and row[-2] == "mm"
+    assert row[-1] == "unobservable" and row[-2] == "mm"
     assert float(row[-4]) == pytest.approx(1e3 * group.value[1], abs=0.05)
     assert float(row[-3]) == pytest.approx(1e3 * group.std[1], rel=0.05)
     assert max(map(len, table)) < 100
@@ -58,7 +58,7 @@ def test_notebooks_show_the_same_as_html(robot: Calibration):
     sharp = dataclasses.replace(robot, warnings=("cam0 < cam1 & more.",))
     found = Cells(sharp._repr_html_())
     assert found.open == [] and found.texts[0] == f"Verdict: {sharp.verdict}"
-    assert "cam0 < cam1 & more." in found.texts and "undetermined" in found.texts
+    assert "cam0 < cam1 & more." in found.texts and "unobservable" in found.texts
     words = " ".join(sharp.summary().split("\n\n")[1].split())
     assert " ".join(" ".join(t.split()) for t in found.texts[1 + len(sharp.reasons) :] if t) == words
 

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from rich.console import Console
+from scipy.spatial.transform import Rotation
 
 from icalib.export.outputs import check_folder, write_outputs
 from icalib.report import report_html
-from icalib.report.console import table
+from icalib.report.console import relative_words, table
 from icalib.report.plot import numbers, thin
 from icalib.result import (
     Calibration,
@@ -27,7 +29,8 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.result.quantities import dof_words, format_number, rows, rpy_deg
+from icalib.result.quantities import TURNS, dof_words, format_number, rows, rpy_deg
+from icalib.result.summary import calibration_yaml
 from icalib.sensors.camera.show import image_figures, projection_figures
 
 VOID = {"meta", "link", "br", "img", "hr"}
@@ -93,10 +96,10 @@ def test_trust_comes_first(text: str):
     page = Page(text)
     assert page.ids[0] == "trust"
     top = page.words.split("The rig")[0]
-    for words in ("Partly usable", "turn the rig about a second axis", "Reasons", "rotation x (roll)", "deg"):
+    for words in ("Partly usable", "turn the rig about a second axis", "Reasons", "roll", "rotation x", "deg"):
         assert words in top
-    rows = dict(re.findall(r"<td>(translation .)</td>.*?badge (\w+)", text))
-    assert rows == {"translation x": "determined", "translation y": "undetermined", "translation z": "weak"}
+    rows = dict(re.findall(r'<td>(translation .)</td>.*?badge \w+">([\w ]+)<', text))
+    assert rows == {"translation x": "determined", "translation y": "unobservable", "translation z": "weak"}
 
 
 def test_a_long_recording_stays_small(calibration: Calibration):
@@ -116,7 +119,7 @@ def test_all_text_is_escaped(calibration: Calibration):
     nasty = dataclasses.replace(
         calibration,
         status=NASTY,
-        undetermined=(NASTY,),
+        unobservable=(NASTY,),
         warnings=(f"{NASTY} again",),
         notes=(NASTY,),
         inputs={NASTY: NASTY},
@@ -231,7 +234,7 @@ def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
         calibration,
         residuals=calibration.residuals | by_key([dataclasses.replace(r, rejected=np.ones_like(r.rejected))]),
         iterations=(),
-        undetermined=(),
+        unobservable=(),
         warnings=(),
         groups=tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups),
     )
@@ -241,7 +244,7 @@ def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
 def test_reasons_stand_in_their_order_and_once(calibration: Calibration):
     groups = tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups)
     words = {"warnings": ("mind.", "it is too large."), "wrong": ("it is too large.",)}
-    mistaken = dataclasses.replace(calibration, undetermined=(), groups=groups, **words)
+    mistaken = dataclasses.replace(calibration, unobservable=(), groups=groups, **words)
     page = report_html(mistaken)
     assert page.index('<li class="bad">it is too large.') < page.index('<li class="care">mind.')
     assert page.count("it is too large.") == 1 and "Not usable. Act on the first reason" in page
@@ -256,25 +259,62 @@ def test_a_poor_fit_colours_the_card(calibration: Calibration):
         return report_html(dataclasses.replace(calibration, groups=groups, fits=(*fits, *calibration.fits[1:])))
 
     assert page(1.0).count('<article class="card determined">') == 2  # the IMU's is that of fixed values
-    for size, css in ((2.0, "weak"), (5.0, "undetermined")):
+    for size, css in ((2.0, "weak"), (5.0, "bad")):
         assert f'<article class="card {css}"><h3>cam0' in page(size**2)
         assert f"residuals {size:.2g}x the stated noise" in page(size**2)
 
 
 def test_rows_are_in_units_that_people_read(calibration: Calibration):
     found = {(r.sensor, r.name): r for r in rows(calibration)}
-    yaw = found["cam0", "rotation z (yaw)"]
-    assert (yaw.value, yaw.std, yaw.unit, yaw.factor) == ("89.150", "0.022", "deg", "2.7")
+    yaw, z = found["cam0", "yaw"], found["cam0", "rotation z"]
+    assert (yaw.value, yaw.unit, yaw.factor, yaw.verdict) == ("89.150", "deg", "", "")
+    assert (z.value, z.std, z.unit, z.factor, z.verdict) == ("", "0.022", "deg", "2.7", "determined")
     y = found["cam1", "translation y"]
-    assert (y.value, y.std, y.formal, y.unit, y.verdict) == ("45.4", "1.2", "0.44", "mm", "undetermined")
+    assert (y.value, y.std, y.formal, y.unit, y.verdict) == ("45.4", "1.2", "0.44", "mm", "unobservable")
     offset = found["cam0", "time offset"]
     assert (offset.value, offset.std, offset.unit) == ("-0.135", "0.030", "ms")
     assert found["cam0", "k1"].std == ""
     assert not any(sensor == "imu0" for sensor, _ in found)
 
 
-def test_rpy_is_that_of_the_rig_file(calibration: Calibration):
-    np.testing.assert_allclose(rpy_deg(calibration.group("cam0", "rotation").value), [0.35, 1.47, 89.15], atol=1e-9)
+def turned(c: Calibration, pitch_deg: float) -> Calibration:
+    """`c` with cam0 turned to roll 20 deg, `pitch_deg` and yaw 30 deg."""
+    R = Rotation.from_euler("xyz", [20.0, pitch_deg, 30.0], degrees=True).as_matrix()
+    return dataclasses.replace(
+        c, groups=tuple(dataclasses.replace(g, value=R) if g is c.group("cam0", "rotation") else g for g in c.groups)
+    )
+
+
+def sampled_rpy(R: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """(3,) standard deviations of roll, pitch and yaw over draws of R Exp(d)."""
+    draws = Rotation.from_rotvec(np.random.default_rng(6).multivariate_normal(np.zeros(3), covariance, 20_000))
+    return (Rotation.from_matrix(R) * draws).as_euler("xyz").std(axis=0)
+
+
+def test_roll_pitch_and_yaw_have_their_own_standard_deviations(calibration: Calibration):
+    """In the table, the YAML and seen from another sensor they are those of samples, also beside gimbal lock; too near
+    to it they are unknown."""
+    c = turned(calibration, 87.0)
+    g = c.group("cam0", "rotation")
+    expected = sampled_rpy(g.value, joint_covariance(c, [g]))
+    assert expected[2] > 10.0 * g.std.max()
+    found = {r.name: r for r in rows(c) if r.sensor == "cam0"}
+    assert [float(found[name].value) for name in TURNS] == pytest.approx([20.0, 87.0, 30.0], abs=0.05)
+    assert [float(found[name].std) for name in TURNS] == pytest.approx(np.rad2deg(expected).tolist(), rel=0.05)
+    entry = yaml.safe_load(calibration_yaml(c))["sensors"]["cam0"]
+    np.testing.assert_allclose(entry["roll_pitch_yaw"], np.deg2rad([20.0, 87.0, 30.0]), atol=1e-9)
+    np.testing.assert_allclose(entry["std"]["roll_pitch_yaw"], expected, rtol=0.03)
+    assert entry["std"]["rotation"] == g.std.tolist()
+    pair = c.T("cam0", "cam1")
+    angles, std = rpy_deg(pair.T[:3, :3], pair.covariance[:3, :3])
+    np.testing.assert_allclose(std, np.rad2deg(sampled_rpy(pair.T[:3, :3], pair.covariance[:3, :3])), rtol=0.03)
+    words = ", ".join(f"{x:.3f} +- {format_number(s)}" for x, s in zip(angles, std, strict=True))
+    assert f"roll, pitch, yaw {words} deg" in " ".join(relative_words(c))
+    locked = turned(calibration, 89.95)
+    assert [r.std for r in rows(locked) if r.sensor == "cam0" and r.name in TURNS] == ["unknown"] * 3
+    entry = yaml.safe_load(calibration_yaml(locked))["sensors"]["cam0"]
+    assert entry["std"]["roll_pitch_yaw"] == [None] * 3 and entry["std"]["rotation"] == g.std.tolist()
+    assert "unknown" in report_html(locked)
 
 
 @pytest.mark.parametrize(
@@ -303,7 +343,7 @@ def test_console_table(calibration: Calibration):
         console.print(table(calibration))
         text = console.export_text()
     line = next(line for line in text.splitlines() if "translation y" in line and "45.4" in line)
-    assert "undetermined" in line and "mm" in line
+    assert "unobservable" in line and "mm" in line
     assert len([line for line in text.splitlines() if line.startswith("│")]) == len(rows(calibration))
 
 

@@ -44,9 +44,9 @@ def test_the_file_loads_back(robot: Calibration, tmp_path: Path, treatment: Trea
     assert (loaded.target, loaded.settings, loaded.gravity) == (same.target, same.settings, same.gravity)
 
 
-def test_what_is_undetermined_is_never_fixed(robot: Calibration, capsys: pytest.CaptureFixture[str], tmp_path: Path):
+def test_what_is_unobservable_is_never_fixed(robot: Calibration, capsys: pytest.CaptureFixture[str], tmp_path: Path):
     rig, sentences = rig_of_result(robot, "fixed")
-    assert sentences == ("cam1: translation y was not determined by the data, so translation is not fixed.",)
+    assert sentences == ("cam1: translation is not fixed, because y is unobservable.",)
     assert parameter(rig, "cam1", "translation").mode == "free" and parameter(rig, "cam1", "rotation").mode == "fixed"
     robot.save(tmp_path / "out")
     assert main(["rig", str(tmp_path / "out"), "--as", "fixed", "-o", str(tmp_path / "rig.yaml")]) == 0

@@ -27,7 +27,7 @@ def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> 
         else g
         for g in c.groups
     )
-    return dataclasses.replace(c, undetermined=(), warnings=(), groups=groups)
+    return dataclasses.replace(c, unobservable=(), warnings=(), groups=groups)
 
 
 @pytest.fixture(scope="module")
@@ -38,10 +38,11 @@ def cases(calibration: Calibration) -> dict[str, Calibration]:
     return {
         "usable": sound,
         "usable: coefficients trade, the projection is known": with_verdicts(calibration, "weak", ("distortion",)),
-        "usable: nuisances": with_verdicts(calibration, "undetermined", ("bloom", "shape", "tilt")),
+        "usable: nuisances": with_verdicts(calibration, "unobservable", ("bloom", "shape", "tilt")),
         "usable with care: weak": with_verdicts(calibration, "weak", ("translation",)),
         "usable with care: warned": dataclasses.replace(sound, warnings=("mind.",)),
-        "partly usable: open": with_verdicts(calibration, "undetermined", ("translation",)),
+        "partly usable: open": with_verdicts(calibration, "unobservable", ("translation",)),
+        "partly usable: too uncertain": with_verdicts(calibration, "too uncertain", ("translation",)),
         "partly usable": calibration,
         "not usable: wrong": dataclasses.replace(sound, **wrong),
         "not usable: wrong and open": dataclasses.replace(calibration, **wrong),
@@ -72,7 +73,7 @@ def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Cal
 def test_single_coefficients_of_a_lens_come_after_its_projection(calibration: Calibration):
     """Its verdict is that of the projection."""
     weak = with_verdicts(calibration, "weak", ("translation",))
-    c = dataclasses.replace(weak, undetermined=("cam0 intrinsics fx: ...",))
+    c = dataclasses.replace(weak, unobservable=("cam0 intrinsics fx: ...",))
     assert c.verdict == "usable with care"
     assert "weakly determined" in c.reasons[-2] and c.reasons[-1] == "cam0 intrinsics fx: ..."
 
@@ -98,7 +99,7 @@ def test_every_place_says_the_same(cases: dict[str, Calibration], tmp_path: Path
 def test_what_must_be_wrong_is_the_first_reason(cases: dict[str, Calibration]):
     assert cases["not usable: wrong"].reasons == ("it is too large.", "mind.")
     words = cases["not usable: wrong and open"]
-    assert words.reasons[:2] == ("it is too large.", words.undetermined[0]) and "mind." in words.reasons
+    assert words.reasons[:2] == ("it is too large.", words.unobservable[0]) and "mind." in words.reasons
     assert cases["not usable: failed"].reasons[0].startswith("the solver did not converge")
     assert (cases["usable"].reasons, cases["usable: nuisances"].reasons) == ((), ())
 
@@ -107,7 +108,23 @@ def test_components_are_named_where_no_direction_is(cases: dict[str, Calibration
     (weak,) = cases["usable with care: weak"].reasons
     assert weak.startswith("cam0 translation x (std 1.1 mm), cam0 translation y (std 1.2 mm)")
     (open_one,) = cases["partly usable: open"].reasons
-    assert "cam1 translation z" in open_one and "undetermined" in open_one
+    assert "cam1 translation z" in open_one and "unobservable" in open_one and "initial guess" in open_one
+    (uncertain,) = cases["partly usable: too uncertain"].reasons
+    assert "cam1 translation z" in uncertain and "exceeds ten tolerances" in uncertain and "guess" not in uncertain
+
+
+def test_every_component_of_a_bad_verdict_is_in_the_reasons(calibration: Calibration):
+    """A sentence on one direction hides neither other unobservable components nor those that are too uncertain."""
+    verdicts = {"rotation": "unobservable", "translation": "too uncertain", "time_offset": "weak"}
+    groups = tuple(
+        dataclasses.replace(g, verdict=(verdicts[g.name],) * len(g.verdict)) if g.name in verdicts else g
+        for g in calibration.groups
+    )
+    directions = ("cam0 rotation x with cam1 rotation x: not determined by this motion; turn.",)
+    found = dataclasses.replace(calibration, groups=groups, unobservable=directions, warnings=())
+    direction, rest, uncertain, weak = found.reasons
+    assert direction == directions[0] and "cam0 rotation x" not in rest and "cam0 rotation y" in rest
+    assert "cam0 translation x" in uncertain and "cam1 time offset" in weak
 
 
 def test_a_lens_is_judged_by_its_projection(calibration: Calibration):
@@ -131,7 +148,7 @@ def test_the_projection_of_a_lens_is_found_once(calibration: Calibration, monkey
 
 
 def test_a_prior_that_the_data_do_not_improve_is_no_reason(calibration: Calibration):
-    found = with_verdicts(calibration, "undetermined", ("time_offset",))
+    found = with_verdicts(calibration, "unobservable", ("time_offset",))
     assert found.verdict == "partly usable"
     groups = tuple(dataclasses.replace(g, mode="prior") if g.name == "time_offset" else g for g in found.groups)
     assert dataclasses.replace(found, groups=groups).verdict == "usable"
@@ -147,10 +164,12 @@ def test_quiet_leaves_warnings_on_standard_error(cases: dict[str, Calibration], 
 
 @pytest.mark.parametrize(
     ("size", "verdict"),
-    [(1.0, "determined"), (1.01, "weak"), (10.0, "weak"), (95.0, "undetermined"), (np.nan, "undetermined")],
+    [(1.0, "determined"), (1.01, "weak"), (10.0, "weak"), (95.0, "too uncertain"), (np.nan, "too uncertain")],
 )
 def test_a_component_is_judged_by_its_printed_size(size: float, verdict: str):
+    """Above ten tolerances it is unobservable if the guess is most of its variance."""
     assert by_size(size) == verdict
+    assert by_size(size, by_guess=True) == verdict.replace("too uncertain", "unobservable")
 
 
 def test_the_baseline_is_that_of_samples(calibration: Calibration):

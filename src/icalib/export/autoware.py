@@ -12,11 +12,11 @@ from icalib.export.common import (
     imu_intrinsics,
     inverse,
     no_place_for,
-    rpy,
     sensor_intrinsics,
     time_offsets,
     yaml_text,
 )
+from icalib.geometry.euler import rpy
 from icalib.result import Calibration
 
 KIT = "sensor_kit_base_link"
@@ -76,4 +76,5 @@ def _pose(c: Calibration, name: str) -> np.ndarray:
 
 
 def _entry(T: np.ndarray) -> dict[str, float]:
-    return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), [*T[:3, 3].tolist(), *rpy(T[:3, :3])], strict=True))
+    values = np.concatenate([T[:3, 3], rpy(T[:3, :3])])
+    return dict(zip(("x", "y", "z", "roll", "pitch", "yaw"), values.tolist(), strict=True))

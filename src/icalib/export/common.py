@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import atan2, cos, hypot, sin
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,9 @@ import yaml
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
-from icalib.result import Calibration
+from icalib.result import Calibration, Verdict
 from icalib.result.body_frame import in_body_frame
+from icalib.result.verdict import TOO_UNCERTAIN
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.sensor import MOUNTED_NAMES
 
@@ -75,20 +76,22 @@ def need(names: Sequence[str], kind: str, program: str) -> None:
 
 
 def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence for each of the sensors `names` that has undetermined parameters."""
+    """A sentence for each of the sensors `names` that has unusable parameters, by verdict."""
+    meanings: dict[Verdict, str] = {
+        "unobservable": "unobservable, so the value depends on the initial guess",
+        "too uncertain": f"too uncertain, with a standard deviation above {TOO_UNCERTAIN:g} tolerances",
+    }
     sentences = []
-    for name in names:
+    for name, (verdict, meaning) in product(names, meanings.items()):
         labels = [
             g.name.replace("_", " ") + ("" if len(g.labels) == 1 else f" {label}")
             for g in c.groups
             if g.sensor == name
-            for label, verdict in zip(g.labels, g.verdict, strict=True)
-            if verdict == "undetermined"
+            for label, v in zip(g.labels, g.verdict, strict=True)
+            if v == verdict
         ]
         if labels:
-            sentences.append(
-                f"{name}: {', '.join(labels)} was not determined by the data; the file has its initial guess."
-            )
+            sentences.append(f"{name}: {', '.join(labels)} is {meaning}.")
     return tuple(sentences)
 
 
@@ -169,14 +172,6 @@ def inverse(T: np.ndarray) -> np.ndarray:
     out[:3, :3] = T[:3, :3].T
     out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
     return out
-
-
-def rpy(R: np.ndarray) -> tuple[float, float, float]:
-    """Roll, pitch, yaw [rad] with R = Rz(yaw) Ry(pitch) Rx(roll), as in URDF. Valid at pitch = +-90 deg, too, because
-    roll is computed from R after the yaw."""
-    yaw = atan2(R[1, 0], R[0, 0])
-    s, k = sin(yaw), cos(yaw)
-    return atan2(s * R[0, 2] - k * R[1, 2], k * R[1, 1] - s * R[0, 1]), atan2(-R[2, 0], hypot(R[0, 0], R[1, 0])), yaw
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:

@@ -16,11 +16,11 @@ from icalib.export.common import (
     imu_intrinsics,
     inverse,
     no_place_for,
-    rpy,
     sensor_intrinsics,
     time_offsets,
 )
 from icalib.export.urdf_tree import Joint, UrdfTree, read_urdf
+from icalib.geometry.euler import rpy
 from icalib.result import Calibration
 
 _TOO_DEEP = 1e-12  # m or rad: smaller values are written as 0

@@ -10,6 +10,7 @@ from xml.parsers import expat
 import numpy as np
 
 from icalib.errors import CalibrationError
+from icalib.sensors.parameter_fields import rotation_of_rpy
 
 _ATTRIBUTES = ("xyz", "rpy")
 
@@ -103,11 +104,8 @@ class UrdfTree:
     def origin(self, joint: Joint) -> np.ndarray:
         """4x4 T_parent_child of a joint. Raises CalibrationError if the origin is not plain numbers."""
         x, y, z = self._numbers(joint, "xyz")
-        roll, pitch, yaw = self._numbers(joint, "rpy")
-        cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
-        R = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         T = np.eye(4)
-        T[:3, :3] = R @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        T[:3, :3] = rotation_of_rpy(*self._numbers(joint, "rpy"))
         T[:3, 3] = x, y, z
         return T
 

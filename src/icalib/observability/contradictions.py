@@ -89,7 +89,7 @@ def _linear(
     columns = np.setdiff1d(np.arange(n), relaxed_rig.fixed_columns(keys))
     outcome, gradient = relaxed_rig.without(keys)
     directions = classify_directions(relaxed_rig.inputs, outcome, columns=columns)
-    noise, null_space = directions.noise, directions.undetermined
+    noise, null_space = directions.noise, directions.unobservable
     t = relaxed_rig.problem.tolerance[columns]
     information = t[:, None] * outcome.information[np.ix_(columns, columns)] * t
     root = restricted_root(information, null_space)

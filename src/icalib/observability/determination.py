@@ -99,12 +99,11 @@ class Determined:
         return t[:, None] * self.estimate.outcome.information * t - self.noise
 
     @property
-    def spread(self) -> np.ndarray:
-        """(B,) standard deviations in tolerances from the data and priors on nuisance parameters, consider covariance
-        included."""
-        t = self.estimate.problem.tolerance
-        covariance = scatter(self.data, self.noise, self.fixed_directions)
-        return np.sqrt(np.diag(covariance) + ((self.shifts / t) ** 2).sum(axis=0))
+    def variances(self) -> tuple[np.ndarray, np.ndarray]:
+        """(B,) variances in squared tolerances: those from the data and priors on nuisance parameters, and those from
+        errors of the guess along the fixed directions (consider covariance)."""
+        by_data = np.diag(scatter(self.data, self.noise, self.fixed_directions))
+        return by_data, ((self.shifts / self.estimate.problem.tolerance) ** 2).sum(axis=0)
 
 
 def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
@@ -176,7 +175,7 @@ class _NullSpaceSearch:
         """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
         but not in the last estimate. LATE rounds and later accept more fixed directions, see `_is_same_null_space`."""
         for k in range(MOST_ROUNDS):
-            last, null_space = self.estimate, self.directions.undetermined
+            last, null_space = self.estimate, self.directions.unobservable
             unchanged = _is_same_null_space(null_space, last.problem.fixed_directions, k >= LATE)
             if unchanged and not last.outcome.stopped_early:
                 return
@@ -274,14 +273,14 @@ class DirectionClasses(NamedTuple):
 
     spurious: the draws behind `noise`. data (B, B): information of the data and of priors on nuisance parameters,
     without `noise`. noise (B, B): the information that noise in the Jacobian adds. information (B, B): without the
-    priors of the rig file, noise included. undetermined (B, m): orthonormal basis of the unobservable directions.
+    priors of the rig file, noise included. unobservable (B, m): orthonormal basis of the unobservable directions.
     """
 
     spurious: Spurious
     data: np.ndarray
     noise: np.ndarray
     information: np.ndarray
-    undetermined: np.ndarray
+    unobservable: np.ndarray
 
 
 def classify_directions(
@@ -315,8 +314,8 @@ def classify_directions(
     directions, noise = principal(spurious), spurious.mean
     # Also without the priors of the model, except those on nuisance parameters.
     data = without([p for p in problem.priors if not p.block.is_nuisance]) - noise
-    undetermined = directions.vectors[:, directions.unobservable | directions.maybe_noise]
-    return DirectionClasses(spurious, t[:, None] * data * t, t[:, None] * noise * t, information, undetermined)
+    unobservable = directions.vectors[:, directions.unobservable | directions.maybe_noise]
+    return DirectionClasses(spurious, t[:, None] * data * t, t[:, None] * noise * t, information, unobservable)
 
 
 def _are_alike(a: np.ndarray, b: np.ndarray) -> bool:

@@ -20,16 +20,23 @@ EVERY_AXIS = "every axis"
 
 @dataclass(frozen=True)
 class Observability:
-    """covariance (B, B): formal. verdicts: one for each column. undetermined: one sentence for each unobservable
-    direction.
+    """covariance (B, B): formal. unobservable: one sentence for each unobservable direction.
 
-    spread (B,): standard deviations in tolerances that the data alone give, consider covariance included.
+    spread (B,): standard deviations in tolerances that the data alone give, consider covariance included; infinite if
+    the solver did not converge. in_null_space, by_guess (B,): whether the parameter lies largely in the null space;
+    whether errors of the guess are most of its variance.
     """
 
     covariance: np.ndarray
-    verdicts: tuple[Verdict, ...]
-    undetermined: tuple[str, ...]
+    unobservable: tuple[str, ...]
     spread: np.ndarray
+    in_null_space: np.ndarray
+    by_guess: np.ndarray
+
+    def verdicts(self, columns: np.ndarray, sizes: np.ndarray) -> tuple[Verdict, ...]:
+        """(n,) verdicts on the parameters of `columns` (n,) with standard deviations of `sizes` (n,) tolerances."""
+        entries = zip(self.in_null_space[columns], self.by_guess[columns], sizes.tolist(), strict=True)
+        return tuple("unobservable" if is_null else by_size(size, bool(guess)) for is_null, guess, size in entries)
 
 
 def observe(
@@ -40,17 +47,15 @@ def observe(
     has_target: bool = True,
     axes: str = "",
 ) -> Observability:
-    """Verdicts from the spread of the data alone; all are undetermined if the solver did not converge.
+    """Observability from the spread of the data alone.
 
     names (B,): such as "cam0.translation.x". specs (B,): definition of each column's group. on_wheels: the rig drives
     on one of its sensors. has_target: the rig has a target. axes: text that names the axes about which the rig hardly
     turned, or empty.
     """
     directions = sparse_basis(determined.fixed_directions)
-    verdicts: list[Verdict] = []
-    for is_null, spread in zip(in_null_space(directions), determined.spread, strict=True):
-        is_undetermined = is_null or not determined.estimate.outcome.converged
-        verdicts.append("undetermined" if is_undetermined else by_size(spread))
+    by_data, by_guess = determined.variances
+    spread = np.sqrt(by_data + by_guess) if determined.estimate.outcome.converged else np.full(len(by_data), np.inf)
     sentences = []
     for direction in directions.T:
         words, first = _words_of(direction, names)
@@ -58,7 +63,7 @@ def observe(
         motion = _missing_motion(spec, on_wheels, has_target).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
         sentences.append(f"{words}: not determined by {by}; {motion}.")
-    return Observability(determined.covariance, tuple(verdicts), tuple(sentences), determined.spread)
+    return Observability(determined.covariance, tuple(sentences), spread, in_null_space(directions), by_guess > by_data)
 
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:

@@ -11,7 +11,7 @@ from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relativ
 from icalib.result.body_frame import in_body_frame
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.quantities import Row, chi2_words, format_number, nontrivial_groups, rms_words, rows
-from icalib.result.verdict import AUXILIARY, by_size, lens_projection_px, lens_verdict, tolerance, worst
+from icalib.result.verdict import AUXILIARY, UNUSABLE, by_size, lens_projection_px, lens_verdict, tolerance, worst
 
 
 def sensor_cards(c: Calibration) -> Html:
@@ -46,7 +46,7 @@ def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
 
 
 def _card(c: Calibration, sensor: str) -> Html:
-    """Card of one sensor. Red: a component is undetermined, residuals are at least `FAR_BEYOND` times the stated noise,
+    """Card of one sensor. Red: a component is unusable, residuals are at least `FAR_BEYOND` times the stated noise,
     or an error in the rig file or recording names the sensor. Amber: a component is weak, or residuals exceed the
     stated noise."""
     lens, fits = c.lenses.get(sensor, ()), [f for f in c.fits if f.sensor == sensor]
@@ -55,11 +55,7 @@ def _card(c: Calibration, sensor: str) -> Html:
     verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if lens else ())))
     fit = max((excess(f) for f in fits), default=1.0)
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
-    css = verdict
-    if named or fit >= FAR_BEYOND:
-        css = "undetermined"
-    elif fit > 1.0 and verdict != "undetermined":
-        css = "weak"
+    css = "bad" if verdict in UNUSABLE or named or fit >= FAR_BEYOND else "weak" if fit > 1.0 else verdict
     marks = [w for w, applies in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if applies]
     badges = [element("span", mark, f"badge {css}") for mark in marks]
     kind = c.rig["sensors"][sensor]["type"]

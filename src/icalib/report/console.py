@@ -7,15 +7,15 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import format_number, rows, rpy_deg
+from icalib.result.quantities import NEAR_LOCK, format_number, rows, rpy_deg
 from icalib.result.summary import body_name, reference_name
-from icalib.result.verdict import UNDETERMINED, tolerance
+from icalib.result.verdict import TOO_UNCERTAIN, UNUSABLE, tolerance
 from icalib.rig.kinds import ALL_SPECS
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 SCALED = "includes the empirical factor: how much more segments of the recording scatter than the noise predicts"
 FORMAL = "is formal: the recording was not split"
-STYLES = {"determined": "green", "weak": "yellow", "undetermined": "bold red", "fixed": "dim"}
+STYLES = {"determined": "green", "weak": "yellow", "fixed": "dim"} | dict.fromkeys(UNUSABLE, "bold red")
 
 
 def table(calibration: Calibration) -> Table:
@@ -32,7 +32,7 @@ def table(calibration: Calibration) -> Table:
         first = i == 0 or table_rows[i - 1].sensor != row.sensor
         last = i + 1 == len(table_rows) or table_rows[i + 1].sensor != row.sensor
         cells = (row.sensor if first else "", row.name, row.value, row.std, row.unit)
-        verdict = Text(row.verdict, style=STYLES[row.verdict])
+        verdict = Text(row.verdict, style=STYLES.get(row.verdict, ""))
         out.add_row(*map(Text, cells), verdict, end_section=last)
     return out
 
@@ -56,9 +56,9 @@ def relative_words(calibration: Calibration) -> list[str]:
     cameras."""
     lines = []
     for r in relative_poses(calibration):
-        turn, move = np.rad2deg(r.std[:3]), 1e3 * r.std[3:]
-        x, y, z = (f"{v:.1f} +- {format_number(s)}" for v, s in zip(1e3 * r.T[:3, 3], move, strict=True))
-        a, b, c = (f"{v:.3f} +- {format_number(s)}" for v, s in zip(rpy_deg(r.T[:3, :3]), turn, strict=True))
+        x, y, z = (f"{v:.1f} +- {format_number(s)}" for v, s in zip(1e3 * r.T[:3, 3], 1e3 * r.std[3:], strict=True))
+        turns = zip(*rpy_deg(r.T[:3, :3], r.covariance[:3, :3]), strict=True)
+        a, b, c = (f"{v:.3f} +- {format_number(s)}" for v, s in turns)
         baseline = ""
         if {r.frame, r.sensor} <= calibration.lenses.keys():
             baseline = f"baseline {1e3 * r.distance:.2f} +- {format_number(1e3 * r.distance_std)} mm; "
@@ -69,16 +69,16 @@ def relative_words(calibration: Calibration) -> list[str]:
 def _caption(calibration: Calibration) -> str:
     body, reference = body_name(calibration), reference_name(calibration)
     text = (
-        f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll), std about the sensor's axes; t_{reference} = "
-        "t_sensor + time offset."
+        f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll); x, y, z: std about the sensor's axes; t_{reference} = "
+        f"t_sensor + time offset. {NEAR_LOCK}"
     )
     scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
     text += f" std {SCALED if scaled else FORMAL}."
-    if {"weak", "undetermined"} & {v for g in calibration.groups for v in g.verdict}:
+    if {"weak", *UNUSABLE} & {v for g in calibration.groups for v in g.verdict}:
         turn, move, time, pixels = (tolerance(calibration, name) for name in TOLERANCES)
         text += (
             f" Tolerances: {turn:g} deg, {1e3 * move:g} mm, {1e3 * time:g} ms, {pixels:g} px; std above it is weak, "
-            f"above {UNDETERMINED:g} of it undetermined."
+            f"above {TOO_UNCERTAIN:g} of it too uncertain; unobservable is what depends on its guess alone."
         )
     names = {g.name for g in calibration.groups}
     return " ".join([text, *(f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.is_auxiliary and s.name in names)])

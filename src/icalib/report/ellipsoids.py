@@ -11,7 +11,7 @@ from icalib.result import Calibration, joint_covariance
 from icalib.result.verdict import worst
 
 SIGMAS = 3.0
-VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "undetermined": "#dc2626"}
+VERDICT_COLORS = {"determined": "#15803d", "weak": "#d97706", "too uncertain": "#dc2626", "unobservable": "#dc2626"}
 _LARGEST = 0.4  # largest half size of determined ellipsoids when magnified, as a fraction of the rig's size
 
 

@@ -7,9 +7,9 @@ from html import escape
 
 import numpy as np
 
-from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import chi2_words, dof_words, format_number, rms_words, rows, rpy_deg
-from icalib.result.verdict import Usability, worst
+from icalib.result import Calibration, joint_covariance, relative_poses
+from icalib.result.quantities import NEAR_LOCK, chi2_words, dof_words, format_number, rms_words, rows, rpy_deg
+from icalib.result.verdict import UNUSABLE, Usability, worst
 from icalib.sensors import call_all_kinds
 
 TRUST: dict[Usability, str] = {
@@ -58,14 +58,14 @@ def reasons(c: Calibration) -> Html:
     """Numbered list of why the verdict is not `usable`, the most important reason first."""
     if not c.reasons:
         return element("p", "None: every check passed.", "quiet")
-    grave = {c.failure, *c.wrong, *c.undetermined}
+    grave = {c.failure, *c.wrong, *c.unobservable}
     items = [element("li", sentence, "bad" if sentence in grave else "care") for sentence in c.reasons]
     return element("ol", items, "reasons")
 
 
 def badge(verdict: str) -> Html:
-    """Coloured label of a verdict."""
-    return element("span", verdict, f"badge {verdict}")
+    """Coloured label of a verdict; empty without one."""
+    return Html("") if not verdict else element("span", verdict, f"badge {'bad' if verdict in UNUSABLE else verdict}")
 
 
 def trust(c: Calibration) -> str:
@@ -95,10 +95,11 @@ def bodies(c: Calibration) -> Html:
 
 def _body_row(c: Calibration, body: str) -> list[object]:
     turn, move = c.group(body, "rotation"), c.group(body, "translation")
-    values = [f"{1e3 * x:.2f}" for x in move.value] + [f"{x:.3f}" for x in rpy_deg(turn.value)]
+    angles, angle_std = rpy_deg(turn.value, joint_covariance(c, [turn]))
+    values = [f"{1e3 * x:.2f}" for x in move.value] + [f"{x:.3f}" for x in angles]
     if turn.columns is None:
         return [*values, "", "", badge("fixed")]
-    std = [format_number(1e3 * float(move.std.max())), format_number(float(np.rad2deg(turn.std.max())))]
+    std = [format_number(1e3 * float(move.std.max())), format_number(float(angle_std.max()))]
     return [*values, *std, badge(worst((*turn.verdict, *move.verdict)))]
 
 
@@ -122,14 +123,15 @@ def relative(c: Calibration) -> Html:
     words = element(
         "p",
         "Standard deviations come from the joint covariance of both sensors, empirical factors included. All of it is "
-        "in calibration.yaml. T_a_b takes coordinates in the frame of b to that of a. Rotation: std about the axes of "
-        "b; position: std along the axes of a. An undetermined component has the uncertainty of its initial guess.",
+        "in calibration.yaml. T_a_b takes coordinates in the frame of b to that of a. Position: std along the axes "
+        f"of a. {NEAR_LOCK} An unobservable component has the uncertainty of its initial guess.",
     )
     headers = ("", "distance [mm]", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
     body = []
     for r in pairs:
-        values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *rpy_deg(r.T[:3, :3])]
-        std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *np.rad2deg(r.std[:3])]
+        angles, angle_std = rpy_deg(r.T[:3, :3], r.covariance[:3, :3])
+        values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *angles]
+        std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *angle_std]
         body.append((r.name, *(f"{x:.3f} ± {format_number(s)}" for x, s in zip(values, std, strict=True))))
     matrices = element("div", [_matrix(r.name, r.T) for r in pairs], "matrices")
     return Html(title + words + table(headers, body, headers[1:]) + matrices)

@@ -10,6 +10,7 @@ import yaml
 
 from icalib.errors import RigError
 from icalib.result import Calibration, ParameterGroup
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig, Settings
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.sensors.parameter import Parameter
@@ -23,7 +24,7 @@ def rig_of_result(c: Calibration, treatment: Treatment) -> tuple[Rig, tuple[str,
 
     fixed: all estimated groups are fixed at their values. prior: all estimated groups get priors with their values as
     means and the standard deviations of the result. guess: groups that were free in the rig file start at their values;
-    priors of the rig file stay. Groups that the rig file fixed stay fixed. A group with an undetermined component is
+    priors of the rig file stay. Groups that the rig file fixed stay fixed. A group with an unusable component is
     never fixed. Raises RigError if `treatment` is none of these.
     """
     if treatment not in TREATMENTS:
@@ -67,15 +68,11 @@ def _treated(g: ParameterGroup, old: Parameter, treatment: Treatment) -> tuple[P
     the parameter in the rig file."""
     if treatment == "guess":
         return (old if old.mode == "prior" else Parameter("free", g.value)), ""
-    undetermined = [label for label, v in zip(g.labels, g.verdict, strict=True) if v == "undetermined"]
-    if treatment == "fixed" and undetermined:
-        what = (
-            f"{g.name.replace('_', ' ')} {', '.join(undetermined)}".rstrip()
-            if len(g.labels) > 1
-            else g.name.replace("_", " ")
-        )
+    labels = ["it"] if len(g.labels) == 1 else g.labels
+    unusable = [f"{label} is {v}" for label, v in zip(labels, g.verdict, strict=True) if v in UNUSABLE]
+    if treatment == "fixed" and unusable:
         kept = old if old.mode == "prior" else Parameter("free", g.value)
-        return kept, f"{g.sensor}: {what} was not determined by the data, so {g.name} is not fixed."
+        return kept, f"{g.sensor}: {g.name} is not fixed, because {', '.join(unusable)}."
     if treatment == "fixed":
         return Parameter("fixed", g.value), ""
     if not (np.isfinite(g.std) & (g.std > 0.0)).all():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from math import radians
+from math import inf, radians
 
 import numpy as np
 from scipy.linalg import orth
@@ -67,14 +67,25 @@ def _pose(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndar
     scale = _scales(c)
     for spec, value, rows in zip(_POSE, (T[:3, :3], T[:3, 3]), (J[:3], J[3:]), strict=True):
         formal, std = (np.sqrt(np.einsum("ij,jk,ik->i", r, c.covariance, r)) for r in (rows, rows * scale))
-        sizes = std / _allowed(c, spec.tolerance)
-        verdict: tuple[Verdict, ...] = tuple("fixed" if s == 0.0 else by_size(s) for s in sizes)
+        sizes, by_guess = std / _allowed(c, spec.tolerance), _by_guess(c, rows)
+        verdict: tuple[Verdict, ...] = tuple(
+            "fixed" if s == 0.0 else by_size(s if c.converged else inf, g) for s, g in zip(sizes, by_guess, strict=True)
+        )
         factor = np.divide(std, formal, out=np.ones(3), where=formal > 0.0)
         mode = "free" if rows.any() else "fixed"
         group = ParameterGroup(
             sensor, spec.name, spec.labels, spec.unit, value, formal, std, verdict, mode, factor=factor
         )
         yield group, rows
+
+
+def _by_guess(c: Calibration, rows: np.ndarray) -> np.ndarray:
+    """(n,) whether unobservable parameters are most of the variance, for n rows of a Jacobian (n, B)."""
+    columns = [k for g in c.groups for k, v in zip(g.columns or (), g.verdict, strict=False) if v == "unobservable"]
+    some = np.zeros_like(rows)
+    some[:, columns] = rows[:, columns]
+    total, part = (np.einsum("ij,jk,ik->i", r, c.covariance, r) for r in (rows, some))
+    return part > 0.5 * total
 
 
 def _rows(c: Calibration, group: ParameterGroup | None) -> np.ndarray:
@@ -120,12 +131,11 @@ def _allowed(c: Calibration, setting: object) -> float:
 
 
 def _with_null_space(c: Calibration, group: ParameterGroup, null: np.ndarray) -> ParameterGroup:
-    """The group with verdict undetermined on each component of a sensor's pose that lies in the null space (B', m). All
-    are undetermined if the solver did not converge."""
+    """The group with verdict unobservable on each component of a sensor's pose that lies in the null space (B', m)."""
     if group.name not in _NAMES or group.columns is None or group.sensor not in c.rig["sensors"]:
         return group
-    is_null = in_null_space(null)[list(group.columns)] | (not c.converged)
+    is_null = in_null_space(null)[list(group.columns)]
     verdict: tuple[Verdict, ...] = tuple(
-        "undetermined" if n else v for n, v in zip(is_null, group.verdict, strict=True)
+        "unobservable" if n else v for n, v in zip(is_null, group.verdict, strict=True)
     )
     return replace(group, verdict=verdict)

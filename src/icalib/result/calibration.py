@@ -23,7 +23,7 @@ from icalib.sensors.records import Residuals, RowResiduals
 if TYPE_CHECKING:
     from icalib.result.relative import RelativePose
 
-Verdict = Literal["determined", "weak", "undetermined", "fixed"]
+Verdict = Literal["determined", "weak", "too uncertain", "unobservable", "fixed"]
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Calibration:
     covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
     null_space: np.ndarray  # (B, m) unobservable directions, orthonormal in units of the tolerances
-    undetermined: tuple[str, ...]  # one sentence each: unobservable combination and the missing motion
+    unobservable: tuple[str, ...]  # one sentence each: unobservable combination and the missing motion
     fits: tuple[SensorFit, ...]
     residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`
     trajectory: Trajectory

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import asin, atan2, floor, isfinite, log10
-from typing import TYPE_CHECKING
+from math import floor, isfinite, log10
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from icalib.geometry import euler
 from icalib.result.body_frame import in_body_frame
+from icalib.result.relative import joint_covariance
 from icalib.result.verdict import worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
@@ -18,12 +20,15 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
+NEAR_LOCK = "Within 5 std of gimbal lock (pitch 90 deg), that of roll, pitch and yaw is unknown."
 SHARPENED = 0.5  # posterior over prior standard deviation: below it, the data contribute most of the information
 
 
 @dataclass(frozen=True)
 class Row:
-    """Text of one parameter for a table. std and formal are empty if the parameter is fixed."""
+    """Text of one parameter for a table. std and formal are empty if the parameter is fixed. value is empty where only
+    the standard deviation is a number, as for rotation about the sensor's axes; verdict and formal are empty for roll,
+    pitch and yaw of an estimated rotation, on which the verdict is by axis."""
 
     sensor: str
     name: str
@@ -32,19 +37,23 @@ class Row:
     formal: str
     factor: str
     unit: str
-    verdict: Verdict
+    verdict: Verdict | Literal[""]
 
 
 def rows(calibration: Calibration) -> list[Row]:
     """Rows of all parameters of all sensors, in the order of the groups, with poses relative to the body. IMU
     intrinsics that stay close to their prior share one row; an ideal IMU has none."""
-    table_rows = []
-    for group in nontrivial_groups(in_body_frame(calibration)):
+    table_rows, in_body = list[Row](), in_body_frame(calibration)
+    for group in nontrivial_groups(in_body):
+        if group.name == "rotation":
+            table_rows += _angle_rows(in_body, group)
+            if group.columns is None:
+                continue
         group_rows = _rows_of(group)
         sharpened = _sharpened(calibration, group)
         table_rows += [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if is_sharper]
         if merged := [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if not is_sharper]:
-            verdict = worst(tuple(row.verdict for row in merged))
+            verdict = worst(tuple(v for v, is_sharper in zip(group.verdict, sharpened, strict=True) if not is_sharper))
             table_rows.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", verdict))
     return table_rows
 
@@ -70,10 +79,10 @@ def nontrivial_groups(calibration: Calibration) -> list[ParameterGroup]:
     ]
 
 
-def rpy_deg(R: np.ndarray) -> np.ndarray:
-    """(3,) roll, pitch, yaw [deg] with R = Rz(yaw) Ry(pitch) Rx(roll), as in the rig file."""
-    pitch = asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
-    return np.rad2deg([atan2(R[2, 1], R[2, 2]), pitch, atan2(R[1, 0], R[0, 0])])
+def rpy_deg(R: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3,) roll, pitch, yaw [deg] with R = Rz(yaw) Ry(pitch) Rx(roll), as in the rig file, and (3,) their standard
+    deviations, see `euler.rpy_std`. covariance (3, 3): of the rotation about the sensor's axes [rad^2]."""
+    return np.rad2deg(euler.rpy(R)), np.rad2deg(euler.rpy_std(R, covariance))
 
 
 def format_number(value: float, digits: int = 2) -> str:
@@ -123,9 +132,18 @@ def _rows_of(group: ParameterGroup) -> list[Row]:
     ]
 
 
+def _angle_rows(c: Calibration, group: ParameterGroup) -> list[Row]:
+    """Rows of roll, pitch and yaw of a rotation."""
+    angles = zip(TURNS, *(x.tolist() for x in rpy_deg(group.value, joint_covariance(c, [group]))), strict=True)
+    if group.columns is None:
+        return [Row(group.sensor, name, f"{angle:.6g}", "", "", "", "deg", "fixed") for name, angle, _ in angles]
+    return [
+        Row(group.sensor, name, _value_text(angle, std), format_number(std), "", "", "deg", "")
+        for name, angle, std in angles
+    ]
+
+
 def _names(group: ParameterGroup) -> list[str]:
-    if group.name == "rotation":
-        return [f"rotation {a} ({turn})" for a, turn in zip("xyz", TURNS, strict=True)]
     if group.labels == (group.name,) or group.labels == ("",):
         return [group.name.replace("_", " ")]
     if group.name in LENS:
@@ -135,9 +153,7 @@ def _names(group: ParameterGroup) -> list[str]:
 
 
 def _values(group: ParameterGroup, scale: float) -> list[float | None]:
-    if group.name == "rotation":
-        return rpy_deg(group.value).tolist()
-    if group.value.ndim == 2:  # a rotation matrix, such as the board's tilt: only its standard deviation is shown
+    if group.value.ndim == 2:  # a rotation matrix: only its standard deviations are shown
         return [None] * len(group.labels)
     return (scale * group.value).tolist()
 

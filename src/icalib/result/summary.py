@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from math import isnan
 from typing import Any
 
 import numpy as np
 import yaml
 
+from icalib.geometry.euler import rpy, rpy_std
 from icalib.result.body_frame import in_body_frame
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
-from icalib.result.relative import RelativePose, relative_poses
+from icalib.result.relative import RelativePose, joint_covariance, relative_poses
 from icalib.rig.kinds import ONE, SENSOR_TYPES
 from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 
@@ -19,15 +21,17 @@ HEADER = """\
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
 {kalibr}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
-#   empirical_factor: the scatter of segments over the predicted one; formal = std / factor.
+#   empirical_factor: the scatter of segments over the predicted one; formal = std / factor. Those of roll_pitch_yaw,
+#   R = Rz(yaw) Ry(pitch) Rx(roll), are null within 5 std of gimbal lock (pitch 90 deg).
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
-#   rotation about the axes of b and translation along those of a; where one is undetermined it is that of the guess.
+#   rotation about the axes of b and translation along those of a; where one is unobservable it is that of the guess.
 # verdict of the whole: usable, usable with care, partly usable or not usable; reasons: why, the most important first.
-# verdict of a component: determined (std within its tolerance), weak (up to 10 tolerances), undetermined (no better
-#   than its initial guess), or fixed by the rig file.
+# verdict of a component: determined (std within its tolerance), weak (up to 10 tolerances), too uncertain (above 10
+#   tolerances), unobservable (the data do not show it; it depends on its initial guess), or fixed by the rig file.
 # The full covariance and all residuals are in result.npz.
 """
+RPY = "roll_pitch_yaw"
 KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
 
 
@@ -46,7 +50,7 @@ def calibration_yaml(calibration: Calibration) -> str:
         "sensors": sensors,
         "targets": targets,
         "relative": {r.name: _relative(r) for r in relative_poses(c)},
-        "undetermined": list(c.undetermined),
+        "unobservable": list(c.unobservable),
         "warnings": list(c.warnings),
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
@@ -105,8 +109,10 @@ def _target(c: Calibration, name: str) -> dict[str, Any]:
 
 
 def _entry(c: Calibration, name: str) -> dict[str, Any]:
-    """Entry of a sensor or target: time_offset and parameters; std, verdict and empirical_factor have the same keys."""
+    """Entry of a sensor or target: time_offset, parameters, and roll, pitch and yaw of a rotation. std, verdict and
+    empirical_factor have the same keys, the latter two without roll, pitch and yaw."""
     groups = tuple(g for g in c.groups if g.sensor == name)
+    rotation = c.group_or_none(name, ROTATION.name)
     by_name = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
     by_label = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)
     entry: dict[str, Any] = {
@@ -116,6 +122,10 @@ def _entry(c: Calibration, name: str) -> dict[str, Any]:
     for key, of in (("std", _std), ("verdict", _verdict), ("empirical_factor", _factor)):
         named_values = {g.name: _short(g, value) for g in by_name if (value := of(g)) is not None}
         entry[key] = named_values | {"parameters": _by_key(by_label, {g.name: of(g) for g in by_label})}
+    if rotation is not None:
+        std = rpy_std(rotation.value, joint_covariance(c, [rotation])).tolist()
+        entry[RPY] = rpy(rotation.value).tolist()
+        entry["std"][RPY] = [None if isnan(s) else s for s in std]
     return entry
 
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 _HEAD = ("sensor", "parameter", "value", "std", "unit", "verdict")
 _RIGHT = (False, False, True, True, False, False)  # alignment of the columns: numbers are right-aligned
-_COLOURS = {"undetermined": "#c62828", "weak": "#b26a00"}
+_COLOURS = {"too uncertain": "#c62828", "unobservable": "#c62828", "weak": "#b26a00"}
 
 
 def one_line(c: Calibration) -> str:

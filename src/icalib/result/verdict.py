@@ -4,7 +4,7 @@ Console, report, calibration.yaml, result.json and the exit code of `--strict` s
 applies of:
 
     not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
-    partly usable     the data leave components undetermined; all other components can be used
+    partly usable     components are unobservable or too uncertain; all others can be used
     usable with care  there is a warning, or a component whose standard deviation exceeds its tolerance
     usable            none of these
 
@@ -36,15 +36,21 @@ NEXT: dict[Usability, str] = {
     "usable": "The solver converged, the data determine every parameter, and no check failed.",
     "usable with care": "Read the reasons before you use the numbers.",
     "partly usable": (
-        "Use no component that is marked undetermined: it is no better than its initial guess. Act on the reasons to "
-        "determine it."
+        "Use no component that is marked unobservable, which depends on its initial guess alone, or too uncertain. Act "
+        "on the reasons to determine it."
     ),
     "not usable": "Act on the first reason, then calibrate again.",
 }
+_MEANINGS: dict[Verdict, str] = {
+    "unobservable": "unobservable, the value depends on the initial guess; {more}",
+    "too uncertain": "too uncertain, the standard deviation exceeds ten tolerances; {more}",
+    "weak": "weakly determined, the standard deviation exceeds the tolerance; {more}, or accept that uncertainty",
+}
 AUXILIARY = tuple(spec.name for spec in ALL_SPECS if spec.is_auxiliary)
-WORST_FIRST: tuple[Verdict, ...] = ("undetermined", "weak", "determined", "fixed")
-UNDETERMINED = 10.0  # standard deviation in tolerances above which the estimate is no better than a guess
-NULL_SPACE_SHARE = 0.25  # squared norm of a component's unit vector in the null space; undetermined above it
+WORST_FIRST: tuple[Verdict, ...] = ("unobservable", "too uncertain", "weak", "determined", "fixed")
+UNUSABLE = WORST_FIRST[:2]  # verdicts on components that must not be used
+TOO_UNCERTAIN = 10.0  # standard deviation in tolerances above which a component must not be used
+NULL_SPACE_SHARE = 0.25  # squared norm of a component's unit vector in the null space; unobservable above it
 MOST_NAMED = 6  # components that one sentence names
 
 
@@ -53,7 +59,7 @@ def usability(c: Calibration) -> Usability:
     if not c.converged or c.wrong:
         return "not usable"
     verdicts = {v for g in c.groups for v in _counted(c, g)}
-    if "undetermined" in verdicts:
+    if verdicts & {*UNUSABLE}:
         return "partly usable"
     return "usable with care" if c.warnings or "weak" in verdicts else "usable"
 
@@ -62,20 +68,22 @@ def reasons(c: Calibration) -> tuple[str, ...]:
     """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
     if not c.converged:
         return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
-    counted = {v for g in c.groups for v in _counted(c, g)} & {"undetermined", "weak"}
+    counted = {v for g in c.groups for v in _counted(c, g)} & {"weak", *UNUSABLE}
     # Standard deviations of a wrong model include its misfit, which a longer recording does not reduce.
-    is_wrong = bool(c.wrong)
-    undetermined = [*c.undetermined, *(() if is_wrong else _unexplained(c))] if counted else []
-    weak = [] if is_wrong else list(_weak(c))
+    unusable, weak = ([], []) if c.wrong else ([*_named(c, *UNUSABLE)], [*_named(c, "weak")])
     rest = [w for w in c.warnings if w not in c.wrong]
-    # Undetermined coefficients of a lens matter little if its projection is known well enough, so they come last.
-    first, last = (undetermined, []) if "undetermined" in counted else ([], undetermined)
-    return tuple(dict.fromkeys([*c.wrong, *first, *rest, *weak, *last]))
+    # Unobservable coefficients of a lens matter little if its projection is known well enough, so they come last.
+    directions = c.unobservable if counted else ()
+    first, last = (directions, ()) if "unobservable" in counted else ((), directions)
+    return tuple(dict.fromkeys([*c.wrong, *first, *unusable, *rest, *weak, *last]))
 
 
-def by_size(tolerances: float) -> Verdict:
-    """Verdict on a component whose standard deviation is `tolerances` times its tolerance; NaN is undetermined."""
-    return "undetermined" if not tolerances <= UNDETERMINED else "determined" if tolerances <= 1.0 else "weak"
+def by_size(tolerances: float, by_guess: bool = False) -> Verdict:
+    """Verdict on a component whose standard deviation is `tolerances` times its tolerance; NaN is as infinity.
+    by_guess: whether errors of the initial guess of unobservable directions are most of its variance."""
+    if not tolerances <= TOO_UNCERTAIN:
+        return "unobservable" if by_guess else "too uncertain"
+    return "determined" if tolerances <= 1.0 else "weak"
 
 
 def in_null_space(directions: np.ndarray) -> np.ndarray:
@@ -111,7 +119,8 @@ def _lens_projection_px(c: Calibration, camera: str) -> float | None:
 def lens_verdict(c: Calibration, camera: str) -> Verdict:
     """Verdict on a lens: its projection uncertainty compared with `pixel_tolerance` of the settings."""
     sigma = lens_projection_px(c, camera)
-    return "fixed" if sigma is None else by_size(sigma / tolerance(c, "pixel_tolerance"))
+    verdicts = {v for g in c.groups if g.sensor == camera and g.name in c.lenses[camera] for v in g.verdict}
+    return "fixed" if sigma is None else by_size(sigma / tolerance(c, "pixel_tolerance"), "unobservable" in verdicts)
 
 
 def tolerance(c: Calibration, name: str) -> float:
@@ -126,27 +135,19 @@ def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
     if g.name in AUXILIARY:
         return ()
     if g.name in c.lenses.get(g.sensor, ()):
-        return (lens_verdict(c, g.sensor),) if {"weak", "undetermined"} & set(g.verdict) else ()
+        return (lens_verdict(c, g.sensor),) if {"weak", *UNUSABLE} & {*g.verdict} else ()
     return () if g.mode == "prior" else g.verdict
 
 
-def _unexplained(c: Calibration) -> Iterator[str]:
-    """A sentence on undetermined components, if no sentence names an unobservable direction."""
-    names = [name for name, verdict in _components(c) if verdict == "undetermined"]
-    if names and not c.undetermined:
-        yield (
-            f"{_listed(names)}: undetermined, the standard deviation exceeds {UNDETERMINED:.0f} tolerances; {_more(c)}."
-        )
-
-
-def _weak(c: Calibration) -> Iterator[str]:
-    """A sentence on weakly determined components, if there are any."""
-    names = [name for name, verdict in _components(c) if verdict == "weak"]
-    if names:
-        yield (
-            f"{_listed(names)}: weakly determined, the standard deviation exceeds the tolerance; {_more(c)}, or accept "
-            "that uncertainty."
-        )
+def _named(c: Calibration, *verdicts: Verdict) -> Iterator[str]:
+    """A sentence for each of `verdicts` on the components that have it, without those that the sentence on an
+    unobservable direction names."""
+    for verdict in verdicts:
+        names = [name for name, v in _components(c) if v == verdict]
+        if verdict == "unobservable":
+            names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
+        if names:
+            yield f"{_listed(names)}: {_MEANINGS[verdict].format(more=_more(c))}."
 
 
 def _more(c: Calibration) -> str:

@@ -99,7 +99,7 @@ def _rotation(value: YamlValue) -> np.ndarray:
         value.fail(f"must be one rotation; write {_ROTATION_FORMS}.")
     if "xyzw" in fields:
         return _from_quaternion(fields["xyzw"])
-    return _from_rpy(*(radians(angle) for angle in fields["rpy_deg"].vector(3)))
+    return rotation_of_rpy(*(radians(angle) for angle in fields["rpy_deg"].vector(3)))
 
 
 def _matrix(value: YamlValue) -> np.ndarray:
@@ -128,7 +128,7 @@ def _from_quaternion(value: YamlValue) -> np.ndarray:
     )
 
 
-def _from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
+def rotation_of_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
     """Rz(yaw) Ry(pitch) Rx(roll), angles in rad."""
     cr, sr, cp, sp, cy, sy = (f(a) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])

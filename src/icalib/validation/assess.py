@@ -35,7 +35,6 @@ from icalib.result import (
 from icalib.result.provenance import versions
 from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
-from icalib.result.verdict import by_size
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
@@ -85,7 +84,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         covariance=observability.covariance,
         covariance_names=_column_names(inputs),
         null_space=determined.fixed_directions,
-        undetermined=observability.undetermined,
+        unobservable=observability.unobservable,
         fits=tuple(assessed.fits),
         residuals=by_key(_residuals(inputs, estimate, timeline)),
         trajectory=_trajectory(inputs, outcome.state, timeline),
@@ -191,9 +190,7 @@ def _groups(
         k = block.columns
         std, factor = formal[k], variances.factor(k, overall)
         sizes = factor * np.maximum(observability.spread[k], std / problem.tolerance[k])
-        verdicts = zip((observability.verdicts[i] for i in k), sizes.tolist(), strict=True)
-        verdict: tuple[Verdict, ...] = tuple(_final_verdict(formal_verdict, size) for formal_verdict, size in verdicts)
-        groups.append(_group(inputs, block, state, std, factor, verdict))
+        groups.append(_group(inputs, block, state, std, factor, observability.verdicts(k, sizes)))
     return tuple(groups)
 
 
@@ -218,11 +215,6 @@ def _is_listed(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
         return not spec.is_auxiliary
     stated = spec.name in [s.name for s in sensor.stated()]
     return stated and (sensor.is_estimated(spec) or getattr(sensor, spec.name).mode == "fixed")
-
-
-def _final_verdict(formal: Verdict, size: float) -> Verdict:
-    """The verdict by the printed standard deviation, `size` tolerances; unobservable directions stay undetermined."""
-    return formal if formal == "undetermined" else by_size(size)
 
 
 def few_segments_notes(inputs: Inputs, segments: Segments | None) -> Iterator[str]:

@@ -11,6 +11,7 @@ from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
 from icalib.initialize.steps.contradicted_guesses import is_contradicted
 from icalib.result import ParameterGroup
+from icalib.result.verdict import UNUSABLE
 from icalib.sensors import call_kind
 from icalib.sensors.parameter_spec import display_unit
 from icalib.validation.looks_like import looks_like
@@ -22,7 +23,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
     groups_by_key = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.user_rig or inputs.rig):
         group, guess = groups_by_key.get((sensor.name, name)), parameter.value
-        if group is None or guess is None or parameter.mode != "free" or "undetermined" in group.verdict:
+        if group is None or guess is None or parameter.mode != "free" or {*UNUSABLE} & {*group.verdict}:
             continue
         far = call_kind(sensor.sensor_type, "assess", "is_far_guess", sensor, name, groups_by_key)
         if far is None:

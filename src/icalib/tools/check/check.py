@@ -23,7 +23,7 @@ from icalib.geometry import so3
 from icalib.pipeline import Progress, calibrate_measurements, measure
 from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covariance
 from icalib.result.as_rig import rig_of_result
-from icalib.result.verdict import AUXILIARY, lens_verdict
+from icalib.result.verdict import AUXILIARY, UNUSABLE, lens_verdict
 from icalib.rig import Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
@@ -124,7 +124,7 @@ def check_measurements(
     tested = [(d, d.sigmas) for d in comparison.differences if d.sigmas is not None]  # else fixed on both sides
     limit = joint_limit(sigma, len(tested))
     changed = tuple(d for d, count in tested if count > limit)
-    unknown = tuple(name for name in _undetermined(new) if name not in _undetermined(calibration))
+    unknown = tuple(name for name in _unusable(new) if name not in _unusable(calibration))
     reason = new.reasons[0] if new.verdict == "not usable" else ""
     validity: Validity = "cannot say" if reason else "changed" if changed else "cannot say" if unknown else "valid"
     drifts = tuple(_drifts(calibration, new))
@@ -153,14 +153,14 @@ def _fits_of_fixed(
         return ()
 
 
-def _undetermined(c: Calibration) -> list[str]:
-    """Names of groups that are undetermined; a lens is classified by the uncertainty of its projection."""
+def _unusable(c: Calibration) -> list[str]:
+    """Names of groups that are unusable; a lens is classified by the uncertainty of its projection."""
     names = []
     for g in c.groups:
         if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
             continue
         lens = g.name in c.lenses.get(g.sensor, ())
-        if (lens_verdict(c, g.sensor) == "undetermined") if lens else ("undetermined" in g.verdict):
+        if {*UNUSABLE} & {*((lens_verdict(c, g.sensor),) if lens else g.verdict)}:
             names.append(_block(c, g))
     return list(dict.fromkeys(names))
 

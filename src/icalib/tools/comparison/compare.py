@@ -44,7 +44,7 @@ class Difference:
     other quantities in `unit`; entries are named by `labels`. size: norm of `vector`; for a lens, RMS distance of image
     points [px]. std (n,), sigmas: from both sides, None if unknown; given_by: the sides that have standard deviations
     ("both", "A", "B", ""). differs: beyond tolerance and limit. open: sides ("A", "B") in which the block is
-    undetermined. most: for a lens, the largest distance of image points [px].
+    unusable. most: for a lens, the largest distance of image points [px].
     """
 
     sensor: str
@@ -105,7 +105,7 @@ class _Pair:
         lens: tuple[float, float] | None = None,
     ) -> Difference:
         """The difference of one block. names: sensor, frame, what; display: unit, and factor from SI to it; open_:
-        sides on which the block is undetermined; lens: RMS and largest distance of image points [px]."""
+        sides on which the block is unusable; lens: RMS and largest distance of image points [px]."""
         vector, covariances, (unit, scale) = change.vector, change.covariances, display
         known = [bool(np.isfinite(c).all() and c.any()) for c in covariances]
         total = sum((np.zeros_like(c) if not np.isfinite(c).all() else c for c in covariances), np.zeros((1, 1)))

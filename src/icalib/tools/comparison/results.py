@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from icalib.result import Calibration, joint_covariance, relative_pose
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.rig.file import load_rig
 from icalib.rig.kinds import SENSOR_TYPES
@@ -38,7 +39,7 @@ def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Q
 def side_of_result(c: Calibration, path: str) -> Side:
     """The side of a calibration, with covariances; path: its name in messages."""
     poses = {name: _pose_of_result(c, name) for name in c.mounted} | {c.reference: np.eye(4)}
-    bad = [g for g in c.groups if "undetermined" in g.verdict]
+    bad = [g for g in c.groups if {*UNUSABLE} & {*g.verdict}]
     quantities = {}
     for g in c.groups:
         # If a clock restarts in each recording, its time offsets have no counterpart in another result.
@@ -77,7 +78,7 @@ def _pose_of_result(c: Calibration, sensor: str) -> np.ndarray:
 
 def _lens_of_result(c: Calibration, name: str) -> LensSide:
     groups = [c.group(name, key) for key in c.lenses[name]]
-    is_open = any("undetermined" in g.verdict for g in groups)
+    is_open = any({*UNUSABLE} & {*g.verdict} for g in groups)
     return _lens(c.rig["sensors"][name], [g.value for g in groups], joint_covariance(c, groups), is_open)
 
 

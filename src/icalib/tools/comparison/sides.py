@@ -14,7 +14,7 @@ PoseCovariance = Callable[[str, str], np.ndarray]
 @dataclass(frozen=True)
 class Quantity:
     """A parameter that is compared by its value. what: its name in sentences; value (n,) in `unit` (SI); covariance
-    (n, n), NaN if unknown; open: undetermined by the data; is_relative: changes are relative to the value."""
+    (n, n), NaN if unknown; open: unobservable or too uncertain; is_relative: changes are relative to the value."""
 
     what: str
     labels: tuple[str, ...]
@@ -28,7 +28,7 @@ class Quantity:
 @dataclass(frozen=True)
 class LensSide:
     """A camera model. resolution: (width, height) px; params (n,): fx, fy, cx, cy [px], distortion; covariance (n, n),
-    NaN if unknown; open: undetermined by the data."""
+    NaN if unknown; open: unobservable or too uncertain."""
 
     model: str
     resolution: tuple[int, int]

@@ -90,7 +90,7 @@ def _certainty(d: Difference) -> str:
     else:
         words = f"{d.sigmas:.1f} sigma" + (f" of {d.given_by} alone" if d.given_by in ("A", "B") else "")
         words += f" (tolerance {_tolerance(d)})" if d.tolerance > 0 else ""
-    return words + (f", undetermined in {' and '.join(d.open)}" if d.open else "")
+    return words + (f", unobservable or too uncertain in {' and '.join(d.open)}" if d.open else "")
 
 
 def _tolerance(d: Difference) -> str:

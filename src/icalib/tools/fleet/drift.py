@@ -32,7 +32,7 @@ class GroupChange:
 class Drift:
     """Changes of one robot. jobs: those with a result, in order of time. changes: beyond `limit` sigmas, between
     successive jobs; from the first to the last job only those that no step shows. unsure: differences that cannot be
-    tested, as they are undetermined or have no standard deviations. n_tested: number of tested differences. notes:
+    tested, as they are unusable or have no standard deviations. n_tested: number of tested differences. notes:
     what could not be compared."""
 
     robot: str

@@ -13,7 +13,6 @@ from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
 _PANEL_PX, _EDGE_PX, _GAPS = 170, 90, 0.2
-OPEN = "undetermined"
 
 
 def sensors(results: list[JobResult]) -> tuple[str, ...]:
@@ -25,7 +24,7 @@ def sensors(results: list[JobResult]) -> tuple[str, ...]:
 def over_time(results: list[JobResult], sensor: str) -> Figure:
     """Figure with a panel for each block of the sensor; results: in order of time.
 
-    Undetermined entries, which are fixed to the guess, have hollow markers and no error bars.
+    Unobservable entries, which depend on the guess, have hollow markers and no error bars.
     """
     blocks = [b for r in results for b in r.record.blocks if b.sensor == sensor and _estimated(b)]
     firsts = {b.name: b for b in reversed(blocks)}
@@ -70,7 +69,7 @@ def _traces(results: list[JobResult], places: dict[str, str], first: GroupRecord
             "line": {"width": 1, "color": colors[k % len(colors)]},
             "text": [r.job.name for r in at],
             "showlegend": len(first.labels) > 1,
-            "marker": {"size": 7, "symbol": ["circle-open" if b.verdict[k] == OPEN else "circle" for b in blocks]},
+            "marker": {"size": 7, "symbol": ["circle-open" if _is_hollow(b, k) else "circle" for b in blocks]},
             "error_y": {"array": numbers(scale * np.array([_bar(b, k) for b in blocks])), "thickness": 1.2, "width": 3},
         }
         for k, label in enumerate(first.labels)
@@ -83,8 +82,12 @@ def _in_legend_once(traces: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return [t | {"showlegend": t["showlegend"] and firsts[t["name"]] == k} for k, t in enumerate(traces)]
 
 
+def _is_hollow(b: GroupRecord, entry: int) -> bool:
+    return b.verdict[entry] == "unobservable"
+
+
 def _bar(b: GroupRecord, entry: int) -> float:
-    return 0.0 if b.verdict[entry] == OPEN else float(b.std[entry])
+    return 0.0 if _is_hollow(b, entry) else float(b.std[entry])
 
 
 def _estimated(b: GroupRecord) -> bool:

@@ -12,7 +12,7 @@ from icalib.tools.fleet.figures import over_time, sensors
 from icalib.tools.fleet.result import Fleet, JobResult, by_robot
 from icalib.tools.fleet.store import JOBS
 
-_BADGES = {"done": "determined", "failed": "undetermined"}  # green, red
+_BADGES = {"done": "determined", "failed": "bad"}  # green, red
 
 
 def fleet_html(fleet: Fleet, title: str) -> str:
@@ -48,7 +48,7 @@ def _aside(count: int) -> Html:
     """Paragraph with a link to the `count` differences that cannot be tested; empty if there are none."""
     if not count:
         return Html("")
-    return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, undetermined or typed."])
+    return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, not determined or typed."])
 
 
 def _robots(fleet: Fleet) -> Html:

@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from icalib.base.own_files import SEAL, sealed
-from icalib.result import Calibration, ParameterGroup
+from icalib.geometry.euler import rpy_std
+from icalib.result import Calibration, ParameterGroup, joint_covariance
 from icalib.result.quantities import nontrivial_groups
 from icalib.tools.batch import plain_record, record_json
 from icalib.tools.fleet.inputs import InputHashes
 
-FORMAT = 1
+FORMAT = 2
 WALL_CLOCK_NS = (10**18, 4 * 10**18)  # 2001 to 2096; clocks that start with the computer are far below
 
 
 @dataclass(frozen=True)
 class GroupRecord:
-    """One parameter group of one sensor, as in `ParameterGroup`. value: (n,), for a rotation (3, 3)."""
+    """One parameter group of one sensor, as in `ParameterGroup`. value: (n,), for a rotation (3, 3). rpy_std: (3,) of
+    roll, pitch and yaw of a rotation [rad], NaN near gimbal lock; else (0,)."""
 
     sensor: str
     name: str
@@ -28,6 +30,7 @@ class GroupRecord:
     value: np.ndarray
     std: np.ndarray  # (n,)
     verdict: tuple[str, ...]
+    rpy_std: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,7 @@ class JobRecord:
     sentence.
 
     inputs: hashes of the inputs; None if the worker died, and the record is not stored. stamp_ns: first stamp of the
-    recording, None unless it is of a wall clock. undetermined, warnings: sentences. blocks: parameter groups.
+    recording, None unless it is of a wall clock. unobservable, warnings: sentences. blocks: parameter groups.
     """
 
     name: str
@@ -45,7 +48,7 @@ class JobRecord:
     inputs: InputHashes | None
     status: str = ""
     stamp_ns: int | None = None
-    undetermined: tuple[str, ...] = ()
+    unobservable: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     blocks: tuple[GroupRecord, ...] = ()
 
@@ -54,15 +57,16 @@ class JobRecord:
         """Record of a job with a result, converged or not."""
         stamp = min((r.origin_ns for r in result.recordings), default=0)
         low, high = WALL_CLOCK_NS
-        blocks = tuple(_block(g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
+        blocks = tuple(_block(result, g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
         return cls(
-            name, result.failure, seconds, inputs, result.status, known, result.undetermined, result.warnings, blocks
+            name, result.failure, seconds, inputs, result.status, known, result.unobservable, result.warnings, blocks
         )
 
 
-def _block(g: ParameterGroup) -> GroupRecord:
-    return GroupRecord(g.sensor, g.name, g.labels, g.unit, g.value, g.std, g.verdict)
+def _block(c: Calibration, g: ParameterGroup) -> GroupRecord:
+    angles = rpy_std(g.value, joint_covariance(c, [g])) if g.value.ndim == 2 else np.empty(0)
+    return GroupRecord(g.sensor, g.name, g.labels, g.unit, g.value, g.std, g.verdict, angles)
 
 
 def to_json(record: JobRecord) -> bytes:
@@ -76,13 +80,13 @@ def from_json(text: bytes) -> JobRecord:
     plain.pop(SEAL, None)
     inputs = plain["inputs"]
     plain["inputs"] = InputHashes(inputs["rig"], tuple(inputs["recordings"]), inputs["program"])
-    for name in ("undetermined", "warnings"):
+    for name in ("unobservable", "warnings"):
         plain[name] = tuple(plain[name])
     plain["blocks"] = tuple(_block_of(b) for b in plain["blocks"])
     return JobRecord(**plain)
 
 
 def _block_of(plain: dict[str, Any]) -> GroupRecord:
-    value, std = (np.array(plain[name], dtype=np.float64) for name in ("value", "std"))
+    value, std, angles = (np.array(plain[name], dtype=np.float64) for name in ("value", "std", "rpy_std"))
     labels, verdict = (tuple(plain[name]) for name in ("labels", "verdict"))
-    return GroupRecord(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict)
+    return GroupRecord(plain["sensor"], plain["name"], labels, plain["unit"], value, std, verdict, angles)

@@ -7,14 +7,12 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
-
 from icalib.base.own_files import DATABASE_ID
 from icalib.base.text_files import printable
 from icalib.errors import CalibrationError
-from icalib.result.quantities import rpy_deg
+from icalib.geometry.euler import rpy
+from icalib.result.quantities import TURNS
 from icalib.tools.batch import replacing
-from icalib.tools.fleet.record import GroupRecord
 from icalib.tools.fleet.result import JobResult
 
 _COLUMNS = (
@@ -36,7 +34,8 @@ _NOTHING = (None,) * 7
 
 def write_table(path: Path, results: Iterable[JobResult]) -> None:
     """Writes the table `results` atomically: a row for each parameter of each job, and one for a job without a result.
-    Units are SI. Rotations are roll, pitch and yaw [rad]; their sigma is of small rotations about the sensor's x, y, z.
+    Units are SI. Rotations have rows of roll, pitch and yaw, each with its own sigma, and of x, y, z: sigma and verdict
+    of small rotations about the sensor's axes.
 
     Raises CalibrationError if the file cannot be written.
     """
@@ -65,9 +64,9 @@ def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
     if not one.record.blocks:
         yield about + _NOTHING
     for b in one.record.blocks:
-        for label, value, std, verdict in zip(b.labels, _values(b), b.std.tolist(), b.verdict, strict=True):
+        values: list[float | None] = [None] * len(b.labels) if b.value.ndim == 2 else b.value.tolist()
+        if b.value.ndim == 2:
+            for turn, value, std in zip(TURNS, rpy(b.value).tolist(), b.rpy_std.tolist(), strict=True):
+                yield (*about, b.sensor, b.name, turn, value, std, b.unit, None)
+        for label, value, std, verdict in zip(b.labels, values, b.std.tolist(), b.verdict, strict=True):
             yield (*about, b.sensor, b.name, label or b.name, value, std, b.unit, verdict)
-
-
-def _values(b: GroupRecord) -> list[float]:
-    return (np.deg2rad(rpy_deg(b.value)) if b.value.ndim == 2 else b.value).tolist()

@@ -43,7 +43,7 @@ def changes(fleet: Fleet) -> list[str]:
 
 
 def unsure(fleet: Fleet) -> list[str]:
-    """Sentences on differences that cannot be tested: undetermined on one side, or without standard deviation."""
+    """Sentences on differences that cannot be tested: unusable on one side, or without standard deviation."""
     return [change_words(d.robot, c) for d in fleet.drifts for c in d.unsure]
 
 
@@ -69,8 +69,8 @@ def span_words(results: list[JobResult]) -> str:
 
 
 def care_words(one: JobResult) -> str:
-    """Number of undetermined combinations and of warnings of a job; "" if there are none."""
-    parts = [_count(len(one.record.undetermined), "combination") + " undetermined"] if one.record.undetermined else []
+    """Number of unobservable combinations and of warnings of a job; "" if there are none."""
+    parts = [_count(len(one.record.unobservable), "combination") + " unobservable"] if one.record.unobservable else []
     parts += [_count(len(one.record.warnings), "warning")] if one.record.warnings else []
     return ", ".join(parts)
 

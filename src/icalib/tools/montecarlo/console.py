@@ -20,7 +20,7 @@ from icalib.tools.montecarlo.words import (
     failures_words,
     largest_words,
     nees_cells,
-    undetermined_words,
+    unobservable_words,
 )
 
 MOST_FAILURES = 10  # that are printed
@@ -31,7 +31,7 @@ def print_study(study: Study, folder: Path) -> None:
     """Prints the table of blocks, failed runs, and the paths of the files on standard output."""
     console, consistency = Console(), study.consistency
     console.print(table(consistency))
-    for line in (answer(consistency), largest_words(consistency), *_failures(consistency), *_undetermined(consistency)):
+    for line in (answer(consistency), largest_words(consistency), *_failures(consistency), *_unobservable(consistency)):
         console.print(line, markup=False)
     seconds = [r.seconds for r in study.records]
     console.print(f"A run took {np.median(seconds):.1f} s (median).", markup=False)
@@ -66,5 +66,5 @@ def _failures(consistency: Consistency) -> list[str]:
     return lines + ([f"  and {more} more, in consistency.json"] if more > 0 else [])
 
 
-def _undetermined(consistency: Consistency) -> list[str]:
-    return [f"Undetermined in {line}" for line in undetermined_words(consistency)]
+def _unobservable(consistency: Consistency) -> list[str]:
+    return [f"Unobservable in {line}" for line in unobservable_words(consistency)]

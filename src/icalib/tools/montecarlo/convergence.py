@@ -61,8 +61,8 @@ def _row(runs: Sequence[RunRecord], block: GroupErrors) -> PanelRow:
     for k, label in enumerate(block.labels):
         curves = tuple(_curve(r, int(r.columns(block.key)[k]), scale) for r in runs if len(r.columns(block.key)))
         verdicts = [b.verdict[k] for r in runs for b in r.blocks if b.key == block.key]
-        times = verdicts.count("undetermined")
-        words = f" (undetermined in {times} of {len(verdicts)})" if times else ""
+        times = verdicts.count("unobservable")
+        words = f" (unobservable in {times} of {len(verdicts)})" if times else ""
         name = block.name if label == block.name else f"{block.name} {label}"
         panels.append(Panel(f"{block.sensor} {name}{words}".replace("_", " "), unit, curves))
     return PanelRow(block.key, tuple(panels))
@@ -74,7 +74,7 @@ def _curve(record: RunRecord, column: int, scale: float) -> Curve:
     verdicts = [v for b in record.blocks for v in b.verdict]
     error = np.array([w.error[column] for w in record.path])
     sigma, in_the_end = np.array([w.std[column] for w in record.path]), record.covariance[column, column]
-    if verdicts[column] == "undetermined":
+    if verdicts[column] == "unobservable":
         sigma = np.full(len(error), np.sqrt(in_the_end))
     elif len(sigma):
         sigma = np.sqrt(sigma**2 + max(in_the_end - sigma[-1] ** 2, 0.0))

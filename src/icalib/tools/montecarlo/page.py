@@ -24,7 +24,7 @@ from icalib.tools.montecarlo.words import (
     largest_words,
     mean_cells,
     nees_cells,
-    undetermined_words,
+    unobservable_words,
     verdict_words,
 )
 
@@ -45,7 +45,7 @@ def study_html(consistency: Consistency, identity: Identity, records: Sequence[R
         element("p", largest_words(consistency)),
         element("h2", "Mean NEES"),
         plot_place("nees"),
-        *_undetermined(consistency),
+        *_unobservable(consistency),
         element("h2", "Failed runs"),
         element("p", failures_words(consistency)),
         failures(consistency),
@@ -106,11 +106,11 @@ def nees_figure(consistency: Consistency) -> Figure:
     return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
 
 
-def _undetermined(consistency: Consistency) -> list[Html]:
-    """Section on what was undetermined in at least one run; empty if nothing was."""
-    if not consistency.undetermined:
+def _unobservable(consistency: Consistency) -> list[Html]:
+    """Section on what was unobservable in at least one run; empty if nothing was."""
+    if not consistency.unobservable:
         return []
-    return [element("h2", "Undetermined"), sentences(undetermined_words(consistency), "care", "None.")]
+    return [element("h2", "Unobservable"), sentences(unobservable_words(consistency), "care", "None.")]
 
 
 def _residuals(consistency: Consistency) -> Html:

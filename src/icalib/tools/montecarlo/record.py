@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.tools.batch import plain_record, record_json
 
-FORMAT = 1
+FORMAT = 2
 LEAST_SIGMA = 1e-100  # replaces a standard deviation of 0, so that an error over it is finite
 
 
@@ -66,7 +66,7 @@ class RunRecord:
     time.
 
     error (n,): estimated minus true, block after block, SI units; for rotations e of R_estimated = R_true Exp(e) [rad].
-    covariance (n, n): formal covariance of `error`. undetermined: sentences on undetermined combinations. path:
+    covariance (n, n): formal covariance of `error`. unobservable: sentences on unobservable combinations. path:
     iterations of the solver from the initial guess to the result. program: digest of the code that ran it.
     """
 
@@ -77,7 +77,7 @@ class RunRecord:
     blocks: tuple[GroupErrors, ...] = ()
     error: np.ndarray = field(default_factory=lambda: np.empty(0))
     covariance: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
-    undetermined: tuple[str, ...] = ()
+    unobservable: tuple[str, ...] = ()
     sizes: tuple[Size, ...] = ()
     whiteness: tuple[Whiteness, ...] = ()
     path: tuple[Waypoint, ...] = ()
@@ -112,7 +112,7 @@ def from_json(text: bytes) -> RunRecord:
     plain["sizes"] = tuple(Size(**s) for s in plain["sizes"])
     plain["whiteness"] = tuple(Whiteness(**w) for w in plain["whiteness"])
     plain["path"] = tuple(Waypoint(w["stage"], np.array(w["error"]), np.array(w["std"])) for w in plain["path"])
-    plain["undetermined"] = tuple(plain["undetermined"])
+    plain["unobservable"] = tuple(plain["unobservable"])
     plain["error"] = np.array(plain["error"], dtype=np.float64)
     n = len(plain["error"])
     plain["covariance"] = np.array(plain["covariance"], dtype=np.float64).reshape(n, n)

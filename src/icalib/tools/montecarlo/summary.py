@@ -1,6 +1,7 @@
 """Summary of the runs of a study, computed from their records.
 
-Statistics exclude entries that are undetermined in a run: their formal standard deviation means nothing.
+Statistics exclude entries that are unusable in a run, which means unobservable or too uncertain: their formal standard
+deviation is that of a guess, or of a problem linearised too far from the truth.
 """
 
 from __future__ import annotations
@@ -12,13 +13,14 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
+from icalib.result.verdict import UNUSABLE
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One parameter of a block over the runs. runs: number of those in which it is not undetermined; rmse, mean_sigma:
+    """One parameter of a block over the runs. runs: number of those in which it is not unusable; rmse, mean_sigma:
     root mean square of its error and of its standard deviation over these runs, or None; verdicts: number of runs of
     each verdict."""
 
@@ -31,11 +33,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class BlockSummary:
-    """One block over the runs, without undetermined entries. dimension: largest number of entries in a run; runs:
+    """One block over the runs, without unusable entries. dimension: largest number of entries in a run; runs:
     number of those with at least one entry.
 
     rmse, mean_sigma: root mean squares over entries and runs. All statistics are None if no run has an entry; spread
-    also if runs are few, or differ in their undetermined entries.
+    also if runs are few, or differ in their unusable entries.
     """
 
     sensor: str
@@ -75,8 +77,8 @@ class Failure:
 @dataclass(frozen=True)
 class Consistency:
     """Summary of a study. runs: number of all; failures: runs that are excluded from the statistics. whole: NEES of all
-    blocks together. largest: among the errors that are not undetermined. sizes: chi^2 per post-fit degree of freedom;
-    lag1: lag-one autocorrelation of whitened residuals. undetermined: number of runs by undetermined combination."""
+    blocks together. largest: among the errors that are not unusable. sizes: chi^2 per post-fit degree of freedom;
+    lag1: lag-one autocorrelation of whitened residuals. unobservable: number of runs by unobservable combination."""
 
     runs: int
     failures: tuple[Failure, ...]
@@ -85,7 +87,7 @@ class Consistency:
     blocks: tuple[BlockSummary, ...]
     sizes: tuple[Mean, ...]
     lag1: tuple[Mean, ...]
-    undetermined: dict[str, int]
+    unobservable: dict[str, int]
 
 
 def summarise(records: Sequence[RunRecord]) -> Consistency:
@@ -106,7 +108,7 @@ def summarise(records: Sequence[RunRecord]) -> Consistency:
         tuple(_block(good, block) for block in first.values()),
         _means([(s.sensor, s.kind, s.chi2, s.dof) for r in good for s in r.sizes if s.dof > 0.0]),
         _means([(w.sensor, w.kind, w.lag1, 1.0) for r in good for w in r.whiteness]),
-        dict(Counter(sentence.split(":")[0] for r in good for sentence in r.undetermined).most_common()),
+        dict(Counter(sentence.split(":")[0] for r in good for sentence in r.unobservable).most_common()),
     )
 
 
@@ -116,24 +118,24 @@ def consistency_json(consistency: Consistency, study: Mapping[str, object]) -> b
 
 
 def counting(record: RunRecord, key: str) -> np.ndarray:
-    """(m,) indices in `record.error` of the entries of block `key` that are not undetermined."""
+    """(m,) indices in `record.error` of the entries of block `key` that are not unusable."""
     block = next((b for b in record.blocks if b.key == key), None)
     if block is None:
         return np.arange(0)
-    return record.columns(key)[[v != "undetermined" for v in block.verdict]]
+    return record.columns(key)[[v not in UNUSABLE for v in block.verdict]]
 
 
 def _errors(record: RunRecord) -> list[tuple[float, str, int]]:
-    """Error in formal standard deviations, name and seed of each entry that is not undetermined."""
+    """Error in formal standard deviations, name and seed of each entry that is not unusable."""
     return [
         (z, block.key if label == block.name else f"{block.key} {label}", record.seed)
         for block, label, verdict, z in record.errors()
-        if verdict != "undetermined"
+        if verdict not in UNUSABLE
     ]
 
 
 def _samples(records: Sequence[RunRecord], keys: tuple[str, ...]) -> list[Sample]:
-    """Sample of the blocks `keys` together for each run, without undetermined entries and runs without entries."""
+    """Sample of the blocks `keys` together for each run, without unusable entries and runs without entries."""
     samples = []
     for r in records:
         k = np.concatenate([np.arange(0), *(counting(r, key) for key in keys)])

@@ -88,7 +88,7 @@ def failures_words(consistency: Consistency) -> str:
     )
 
 
-def undetermined_words(consistency: Consistency) -> list[str]:
-    """A line for each undetermined combination, with the number of runs in which it was undetermined."""
+def unobservable_words(consistency: Consistency) -> list[str]:
+    """A line for each unobservable combination, with the number of runs in which it was unobservable."""
     reached = consistency.runs - len(consistency.failures)
-    return [f"{n} of {reached} runs: {what}" for what, n in consistency.undetermined.items()]
+    return [f"{n} of {reached} runs: {what}" for what, n in consistency.unobservable.items()]

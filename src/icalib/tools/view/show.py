@@ -58,7 +58,7 @@ def _log_result(stream: RerunStream, c: Calibration) -> None:
 
 def summary(c: Calibration, notes: list[str]) -> str:
     """Status, warnings and parameters of the result, in Markdown."""
-    sentences = [("Undetermined", c.undetermined), ("Warning", c.warnings), ("Shown", notes)]
+    sentences = [("Unobservable", c.unobservable), ("Warning", c.warnings), ("Shown", notes)]
     if c.mounted:
         sentences.append(("Ellipsoids", [f"{SIGMAS:g} sigma of each position, {magnification(c):g} times as large."]))
     listed = [f"- {title}: {sentence}" for title, of in sentences for sentence in of]

@@ -177,7 +177,7 @@ def _view(v: TargetView) -> Iterator[Finding]:
         yield Finding(
             "warning",
             f"{v.camera} never sees the target at the {', '.join(empty)} of the image, so the lens is "
-            "undetermined there; move the target there as well.",
+            "extrapolated there; move the target there as well.",
         )
     if v.tilt_deg and v.tilt_deg[2] < FLAT_DEG:
         yield Finding(
