@@ -29,7 +29,7 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.result.quantities import TURNS, dof_words, format_number, rows, rpy_deg
+from icalib.result.quantities import TURNS, chi2_words, dof_words, format_number, rows, rpy_deg
 from icalib.result.summary import calibration_yaml
 from icalib.sensors.camera.show import image_figures, projection_figures
 
@@ -325,9 +325,19 @@ def test_shown(value: float, words: str):
     assert format_number(value) == words
 
 
-@pytest.mark.parametrize(("dof", "words"), [(19800.5, "19800"), (0.6, "1"), (-12.3, "0")])
-def test_sampled_degrees_of_freedom_are_never_less_than_none(dof: float, words: str):
-    assert dof_words(SensorFit("imu0", "bias walk", 1794, dof, 0.1)) == words
+@pytest.mark.parametrize(
+    ("count", "dof", "words"),
+    [
+        (20000, 19800.5, "19800"),
+        (1794, 0.6, "at most 85 of 1794"),
+        (1794, -12.3, "at most 85 of 1794"),
+        (3, 1, "at most 3 of 3"),
+    ],
+)
+def test_degrees_of_freedom_below_their_sampling_error_are_bounded(count: int, dof: float, words: str):
+    """Many residuals never stand beside no degree of freedom."""
+    fit = SensorFit("imu0", "bias walk", count, dof, 0.1)
+    assert dof_words(fit) == words and (chi2_words(fit) == "n/a") == words.startswith("at most")
 
 
 def test_numbers_and_thinning():

@@ -20,7 +20,7 @@ from icalib.result.verdict import NEXT, Usability
 
 LINE_EVERY_S = 30.0  # interval between progress lines if stderr is no terminal
 RESIDUALS = "Residuals: chi^2 per degree of freedom is 1 where noise is as stated; in brackets the degrees of freedom."
-NO_REDUNDANCY = "n/a: the recording cannot test this noise, so the value stated in the rig file is used as it is."
+NO_REDUNDANCY = "n/a: too few degrees of freedom are left to test this noise, so the stated one is used as it is."
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",
     "usable with care": "bold yellow",

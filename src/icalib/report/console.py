@@ -7,30 +7,25 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import NEAR_LOCK, format_number, rows, rpy_deg
+from icalib.result.quantities import NEAR_LOCK, TURNS, Row, format_number, rpy_deg, table_rows
 from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import TOO_UNCERTAIN, UNUSABLE, tolerance
 from icalib.rig.kinds import ALL_SPECS
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")
 SCALED = "includes the empirical factor: how much more segments of the recording scatter than the noise predicts"
-FORMAL = "is formal: the recording was not split"
 STYLES = {"determined": "green", "weak": "yellow", "fixed": "dim"} | dict.fromkeys(UNUSABLE, "bold red")
 
 
 def table(calibration: Calibration) -> Table:
     """Table with one row for each parameter: sensor, name, value, standard deviation, unit, verdict."""
-    out = Table(title="Calibration", caption=_caption(calibration), caption_justify="left", title_justify="left")
+    shown = table_rows(calibration)
+    out = Table(title="Calibration", caption=_caption(calibration, shown), caption_justify="left", title_justify="left")
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
-    sensors = calibration.rig["sensors"]  # sensors come first, parameters of the target last
-    table_rows = sorted(
-        (r for r in rows(calibration) if r.sensor not in calibration.bodies),
-        key=lambda r: r.sensor not in sensors,
-    )
-    for i, row in enumerate(table_rows):
-        first = i == 0 or table_rows[i - 1].sensor != row.sensor
-        last = i + 1 == len(table_rows) or table_rows[i + 1].sensor != row.sensor
+    for i, row in enumerate(shown):
+        first = i == 0 or shown[i - 1].sensor != row.sensor
+        last = i + 1 == len(shown) or shown[i + 1].sensor != row.sensor
         cells = (row.sensor if first else "", row.name, row.value, row.std, row.unit)
         verdict = Text(row.verdict, style=STYLES.get(row.verdict, ""))
         out.add_row(*map(Text, cells), verdict, end_section=last)
@@ -66,19 +61,21 @@ def relative_words(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _caption(calibration: Calibration) -> str:
+def _caption(calibration: Calibration, shown: list[Row]) -> str:
     body, reference = body_name(calibration), reference_name(calibration)
     text = (
         f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll); x, y, z: std about the sensor's axes; t_{reference} = "
-        f"t_sensor + time offset. {NEAR_LOCK}"
+        "t_sensor + time offset."
     )
-    scaled = any(g.columns is not None and g.factor is not None for g in calibration.groups)
-    text += f" std {SCALED if scaled else FORMAL}."
+    scaled = any(g.factor is not None and (g.factor > 1.0).any() for g in calibration.groups)
+    text += f" std {SCALED if scaled else 'is formal'}."
     if {"weak", *UNUSABLE} & {v for g in calibration.groups for v in g.verdict}:
         turn, move, time, pixels = (tolerance(calibration, name) for name in TOLERANCES)
         text += (
             f" Tolerances: {turn:g} deg, {1e3 * move:g} mm, {1e3 * time:g} ms, {pixels:g} px; std above it is weak, "
             f"above {TOO_UNCERTAIN:g} of it too uncertain; unobservable is what depends on its guess alone."
         )
+    if any(row.std == "unknown" and row.name in TURNS for row in shown):
+        text += f" {NEAR_LOCK}"
     names = {g.name for g in calibration.groups}
     return " ".join([text, *(f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.is_auxiliary and s.name in names)])

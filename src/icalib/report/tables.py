@@ -8,7 +8,7 @@ from html import escape
 import numpy as np
 
 from icalib.result import Calibration, joint_covariance, relative_poses
-from icalib.result.quantities import NEAR_LOCK, chi2_words, dof_words, format_number, rms_words, rows, rpy_deg
+from icalib.result.quantities import NEAR_LOCK, chi2_words, dof_words, format_number, rms_words, rpy_deg, table_rows
 from icalib.result.verdict import UNUSABLE, Usability, worst
 from icalib.sensors import call_all_kinds
 
@@ -76,10 +76,7 @@ def trust(c: Calibration) -> str:
 def parameters(c: Calibration) -> Html:
     """Table of all parameters except poses of the target's rigid bodies; sensors come first."""
     headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
-    table_rows = sorted(
-        (r for r in rows(c) if r.sensor not in c.bodies), key=lambda r: r.sensor not in c.rig["sensors"]
-    )
-    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in table_rows]
+    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in table_rows(c)]
     return table(headers, body, ("value", "std", "formal std", "factor"))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import floor, isfinite, log10
+from math import floor, isfinite, log10, sqrt
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -40,22 +40,28 @@ class Row:
     verdict: Verdict | Literal[""]
 
 
+def table_rows(calibration: Calibration) -> list[Row]:
+    """`rows` for a table, sensors first, without the poses of the rigid bodies of a target, which can be many."""
+    shown = (r for r in rows(calibration) if r.sensor not in calibration.bodies)
+    return sorted(shown, key=lambda r: r.sensor not in calibration.rig["sensors"])
+
+
 def rows(calibration: Calibration) -> list[Row]:
     """Rows of all parameters of all sensors, in the order of the groups, with poses relative to the body. IMU
     intrinsics that stay close to their prior share one row; an ideal IMU has none."""
-    table_rows, in_body = list[Row](), in_body_frame(calibration)
+    out, in_body = list[Row](), in_body_frame(calibration)
     for group in nontrivial_groups(in_body):
         if group.name == "rotation":
-            table_rows += _angle_rows(in_body, group)
+            out += _angle_rows(in_body, group)
             if group.columns is None:
                 continue
         group_rows = _rows_of(group)
         sharpened = _sharpened(calibration, group)
-        table_rows += [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if is_sharper]
+        out += [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if is_sharper]
         if merged := [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if not is_sharper]:
             verdict = worst(tuple(v for v, is_sharper in zip(group.verdict, sharpened, strict=True) if not is_sharper))
-            table_rows.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", verdict))
-    return table_rows
+            out.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", verdict))
+    return out
 
 
 def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
@@ -97,12 +103,13 @@ def format_number(value: float, digits: int = 2) -> str:
 
 def chi2_words(fit: SensorFit) -> str:
     """Text of chi^2 per post-fit degree of freedom."""
-    return "n/a (no redundancy)" if fit.chi2_per_dof is None else format_number(fit.chi2_per_dof, 3)
+    return "n/a" if fit.chi2_per_dof is None else format_number(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:
-    """Text of the post-fit degrees of freedom. They are estimated by sampling; negative estimates are shown as 0."""
-    return f"{max(fit.dof, 0.0):.0f}"
+    """Text of the post-fit degrees of freedom; below their sampling error an upper bound, two such errors more."""
+    limit = max(fit.dof, 0.0) + 2.0 * sqrt(fit.count)
+    return f"{fit.dof:.0f}" if fit.chi2_per_dof is not None else f"at most {min(limit, fit.count):.0f} of {fit.count}"
 
 
 def rms_words(fit: SensorFit) -> str:

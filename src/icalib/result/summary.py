@@ -152,7 +152,7 @@ def _factor(group: ParameterGroup) -> np.ndarray | None:
 
 
 def _fit(f: SensorFit) -> dict[str, Any]:
-    fit: dict[str, Any] = {"sensor": f.sensor, "kind": f.kind, "count": int(f.count), "dof": float(f.dof)}
+    fit: dict[str, Any] = {"sensor": f.sensor, "kind": f.kind, "count": int(f.count), "dof": max(float(f.dof), 0.0)}
     fit |= {"chi2": float(f.chi2), "chi2_per_dof": f.chi2_per_dof}
     if f.rms is not None:
         fit |= {"rms": float(f.rms), "unit": f.unit, "rejected": int(f.rejected)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 from typing import TYPE_CHECKING
 
-from icalib.result.quantities import Row, rows
+from icalib.result.quantities import Row, table_rows
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration
@@ -25,7 +25,7 @@ def one_line(c: Calibration) -> str:
 
 def summary_text(c: Calibration) -> str:
     """The verdict with its reasons, and a table of all parameters with standard deviations and verdicts."""
-    table = [_HEAD, *(_cells(row) for row in _rows(c))]
+    table = [_HEAD, *(_cells(row) for row in table_rows(c))]
     widths = [max(len(cells[k]) for cells in table) for k in range(len(_HEAD))]
     lines = []
     for cells in table:
@@ -37,18 +37,12 @@ def summary_text(c: Calibration) -> str:
 def summary_html(c: Calibration) -> str:
     """The verdict with its reasons, and the table of `summary_text`, as HTML."""
     head = "".join(f"<th>{name}</th>" for name in _HEAD)
-    body = "".join(f"<tr>{''.join(_html_cells(row))}</tr>" for row in _rows(c))
+    body = "".join(f"<tr>{''.join(_html_cells(row))}</tr>" for row in table_rows(c))
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in c.reasons)
     listed = f"<ol>{reasons}</ol>" if reasons else ""
     return (
         f"<p><b>Verdict: {c.verdict}</b></p>{listed}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
     )
-
-
-def _rows(c: Calibration) -> list[Row]:
-    """Rows of the table. Poses of the rigid bodies of a target are left out, as they can be many; calibration.yaml has
-    them."""
-    return [row for row in rows(c) if row.sensor not in c.bodies]
 
 
 def _reasons(c: Calibration) -> list[str]:
