@@ -16,6 +16,7 @@ from icalib.cli import main
 from icalib.cli.console import print_result, print_warnings
 from icalib.report import report_html
 from icalib.result import Calibration, load_calibration, relative_pose, verdict
+from icalib.result.quantities import rows
 from icalib.result.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
 
 
@@ -152,6 +153,26 @@ def test_a_prior_that_the_data_do_not_improve_is_no_reason(calibration: Calibrat
     assert found.verdict == "partly usable"
     groups = tuple(dataclasses.replace(g, mode="prior") if g.name == "time_offset" else g for g in found.groups)
     assert dataclasses.replace(found, groups=groups).verdict == "usable"
+
+
+def test_verdicts_without_weight_are_in_brackets(cases: dict[str, Calibration], calibration: Calibration):
+    """So that no table contradicts the verdict on the result: nuisances, priors, and coefficients of a lens that
+    projects well; the caption says so."""
+    prior = tuple(
+        dataclasses.replace(g, mode="prior", verdict=("weak",)) if g.name == "time_offset" else g
+        for g in cases["usable"].groups
+    )
+    lens = "usable: coefficients trade, the projection is known"
+    cases = cases | {"usable: prior": dataclasses.replace(cases["usable"], groups=prior)}
+    cases |= {lens: with_verdicts(calibration, "weak", ("intrinsics",))}
+    for name, c in cases.items():
+        found = {r.verdict for r in rows(c)} - {"", "determined", "fixed"}
+        bracketed = {v for v in found if v.startswith("(")}
+        assert (c.verdict == "usable" or bool(c.warnings)) or found - bracketed, name
+        assert c.verdict != "usable" or found == bracketed, name
+        assert ("In brackets: without weight" in console_of(c)) == bool(bracketed), name
+    assert {r.verdict for r in rows(cases["usable: prior"]) if r.name == "time offset"} == {"(weak)"}
+    assert {r.verdict for r in rows(cases[lens]) if r.name == "fx"} == {"(weak)"}
 
 
 def test_quiet_leaves_warnings_on_standard_error(cases: dict[str, Calibration], capsys: pytest.CaptureFixture[str]):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
@@ -175,15 +176,9 @@ def inverse(T: np.ndarray) -> np.ndarray:
 
 
 def quaternion(R: np.ndarray) -> tuple[float, float, float, float]:
-    """Unit quaternion x, y, z, w of a rotation matrix, w >= 0. It is the dominant eigenvector of a symmetric matrix
-    (Bar-Itzhack 2000), which needs no special cases."""
-    K = np.zeros((4, 4))
-    K[:3, :3] = R + R.T - np.trace(R) * np.eye(3)
-    K[3, :3] = K[:3, 3] = [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]
-    K[3, 3] = np.trace(R)
-    x, y, z, w = np.linalg.eigh(K)[1][:, -1].tolist()
-    sign = -1.0 if w < 0 else 1.0
-    return sign * x, sign * y, sign * z, sign * w
+    """Unit quaternion x, y, z, w of a rotation matrix, w >= 0."""
+    x, y, z, w = Rotation.from_matrix(R).as_quat(canonical=True).tolist()
+    return x, y, z, w
 
 
 def opencv_matrix(name: str, T: np.ndarray, kind: str = "d") -> list[str]:

@@ -11,7 +11,16 @@ from icalib.result import Calibration, RelativePose, SensorFit, Verdict, relativ
 from icalib.result.body_frame import in_body_frame
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.quantities import Row, chi2_words, format_number, nontrivial_groups, rms_words, rows
-from icalib.result.verdict import AUXILIARY, UNUSABLE, by_size, lens_projection_px, lens_verdict, tolerance, worst
+from icalib.result.verdict import (
+    AUXILIARY,
+    UNUSABLE,
+    by_size,
+    counted,
+    lens_projection_px,
+    lens_verdict,
+    tolerance,
+    worst,
+)
 
 
 def sensor_cards(c: Calibration) -> Html:
@@ -51,7 +60,7 @@ def _card(c: Calibration, sensor: str) -> Html:
     stated noise."""
     lens, fits = c.lenses.get(sensor, ()), [f for f in c.fits if f.sensor == sensor]
     groups = [g for g in nontrivial_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
-    verdicts: list[Verdict] = [v for g in groups if g.name not in lens for v in g.verdict]
+    verdicts: list[Verdict] = [v for g in groups for v in counted(c, g)]
     verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if lens else ())))
     fit = max((excess(f) for f in fits), default=1.0)
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)

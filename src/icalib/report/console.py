@@ -7,7 +7,7 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
-from icalib.result.quantities import NEAR_LOCK, TURNS, Row, format_number, rpy_deg, table_rows
+from icalib.result.quantities import NEAR_LOCK, NOT_COUNTED, TURNS, Row, format_number, rpy_deg, table_rows
 from icalib.result.summary import body_name, reference_name
 from icalib.result.verdict import TOO_UNCERTAIN, UNUSABLE, tolerance
 from icalib.rig.kinds import ALL_SPECS
@@ -19,13 +19,15 @@ STYLES = {"determined": "green", "weak": "yellow", "fixed": "dim"} | dict.fromke
 
 def table(calibration: Calibration) -> Table:
     """Table with one row for each parameter: sensor, name, value, standard deviation, unit, verdict."""
-    shown = table_rows(calibration)
-    out = Table(title="Calibration", caption=_caption(calibration, shown), caption_justify="left", title_justify="left")
+    entries = table_rows(calibration)
+    out = Table(
+        title="Calibration", caption=_caption(calibration, entries), caption_justify="left", title_justify="left"
+    )
     for header in ("sensor", "parameter", "value", "std", "unit", "verdict"):
         out.add_column(header, justify="right" if header in ("value", "std") else "left", no_wrap=True)
-    for i, row in enumerate(shown):
-        first = i == 0 or shown[i - 1].sensor != row.sensor
-        last = i + 1 == len(shown) or shown[i + 1].sensor != row.sensor
+    for i, row in enumerate(entries):
+        first = i == 0 or entries[i - 1].sensor != row.sensor
+        last = i + 1 == len(entries) or entries[i + 1].sensor != row.sensor
         cells = (row.sensor if first else "", row.name, row.value, row.std, row.unit)
         verdict = Text(row.verdict, style=STYLES.get(row.verdict, ""))
         out.add_row(*map(Text, cells), verdict, end_section=last)
@@ -61,7 +63,7 @@ def relative_words(calibration: Calibration) -> list[str]:
     return lines
 
 
-def _caption(calibration: Calibration, shown: list[Row]) -> str:
+def _caption(calibration: Calibration, entries: list[Row]) -> str:
     body, reference = body_name(calibration), reference_name(calibration)
     text = (
         f"T_{body}_sensor; rotation: Rz(yaw) Ry(pitch) Rx(roll); x, y, z: std about the sensor's axes; t_{reference} = "
@@ -75,7 +77,9 @@ def _caption(calibration: Calibration, shown: list[Row]) -> str:
             f" Tolerances: {turn:g} deg, {1e3 * move:g} mm, {1e3 * time:g} ms, {pixels:g} px; std above it is weak, "
             f"above {TOO_UNCERTAIN:g} of it too uncertain; unobservable is what depends on its guess alone."
         )
-    if any(row.std == "unknown" and row.name in TURNS for row in shown):
+    if any(row.verdict.startswith("(") for row in entries):
+        text += f" {NOT_COUNTED}"
+    if any(row.std == "unknown" and row.name in TURNS for row in entries):
         text += f" {NEAR_LOCK}"
     names = {g.name for g in calibration.groups}
     return " ".join([text, *(f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.is_auxiliary and s.name in names)])

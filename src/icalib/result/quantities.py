@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import floor, isfinite, log10, sqrt
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from icalib.geometry import euler
 from icalib.result.body_frame import in_body_frame
 from icalib.result.relative import joint_covariance
-from icalib.result.verdict import worst
+from icalib.result.verdict import counted, worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
 from icalib.sensors.parameter_spec import display_unit
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
 
 TURNS = ("roll", "pitch", "yaw")
+NOT_COUNTED = "In brackets: without weight in the verdict, as auxiliary, with a prior, or of a lens that projects well."
 NEAR_LOCK = "Within 5 std of gimbal lock (pitch 90 deg), that of roll, pitch and yaw is unknown."
 SHARPENED = 0.5  # posterior over prior standard deviation: below it, the data contribute most of the information
 
@@ -28,7 +29,8 @@ SHARPENED = 0.5  # posterior over prior standard deviation: below it, the data c
 class Row:
     """Text of one parameter for a table. std and formal are empty if the parameter is fixed. value is empty where only
     the standard deviation is a number, as for rotation about the sensor's axes; verdict and formal are empty for roll,
-    pitch and yaw of an estimated rotation, on which the verdict is by axis."""
+    pitch and yaw of an estimated rotation, on which the verdict is by axis. A verdict that does not count for that on
+    the result, see `verdict.counted`, is in brackets."""
 
     sensor: str
     name: str
@@ -37,13 +39,13 @@ class Row:
     formal: str
     factor: str
     unit: str
-    verdict: Verdict | Literal[""]
+    verdict: str
 
 
 def table_rows(calibration: Calibration) -> list[Row]:
     """`rows` for a table, sensors first, without the poses of the rigid bodies of a target, which can be many."""
-    shown = (r for r in rows(calibration) if r.sensor not in calibration.bodies)
-    return sorted(shown, key=lambda r: r.sensor not in calibration.rig["sensors"])
+    placed = (r for r in rows(calibration) if r.sensor not in calibration.bodies)
+    return sorted(placed, key=lambda r: r.sensor not in calibration.rig["sensors"])
 
 
 def rows(calibration: Calibration) -> list[Row]:
@@ -55,12 +57,13 @@ def rows(calibration: Calibration) -> list[Row]:
             out += _angle_rows(in_body, group)
             if group.columns is None:
                 continue
-        group_rows = _rows_of(group)
+        group_rows = _rows_of(group, counted(calibration, group))
         sharpened = _sharpened(calibration, group)
         out += [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if is_sharper]
         if merged := [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if not is_sharper]:
             verdict = worst(tuple(v for v, is_sharper in zip(group.verdict, sharpened, strict=True) if not is_sharper))
-            out.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", verdict))
+            words = _verdict_words(verdict, counted(calibration, group))
+            out.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", words))
     return out
 
 
@@ -120,7 +123,11 @@ def rms_words(fit: SensorFit) -> str:
     return f"{format_number(scale * fit.rms, 3)} {unit}".rstrip()
 
 
-def _rows_of(group: ParameterGroup) -> list[Row]:
+def _verdict_words(verdict: Verdict, counting: tuple[Verdict, ...]) -> str:
+    return verdict if verdict in ("determined", "fixed", *counting) else f"({verdict})"
+
+
+def _rows_of(group: ParameterGroup, counting: tuple[Verdict, ...]) -> list[Row]:
     unit, scale = display_unit(group.unit)
     names, values = _names(group), _values(group, scale)
     factors = [None] * len(names) if group.columns is None or group.factor is None else group.factor.tolist()
@@ -133,7 +140,7 @@ def _rows_of(group: ParameterGroup) -> list[Row]:
             formal="" if verdict == "fixed" else format_number(scale * group.std_formal[i]),
             factor="" if factors[i] is None else f"{factors[i]:.1f}",
             unit=unit,
-            verdict=verdict,
+            verdict=_verdict_words(verdict, counting),
         )
         for i, verdict in enumerate(group.verdict)
     ]

@@ -33,7 +33,7 @@ Usability = Literal["usable", "usable with care", "partly usable", "not usable"]
 
 EXIT_CODES: dict[Usability, int] = {"usable": 0, "usable with care": 3, "partly usable": 4, "not usable": 5}
 NEXT: dict[Usability, str] = {
-    "usable": "The solver converged, the data determine every parameter, and no check failed.",
+    "usable": "The solver converged, every component that counts is determined, and no check failed.",
     "usable with care": "Read the reasons before you use the numbers.",
     "partly usable": (
         "Use no component that is marked unobservable, which depends on its initial guess alone, or too uncertain. Act "
@@ -58,7 +58,7 @@ def usability(c: Calibration) -> Usability:
     """The verdict on the whole result."""
     if not c.converged or c.wrong:
         return "not usable"
-    verdicts = {v for g in c.groups for v in _counted(c, g)}
+    verdicts = {v for g in c.groups for v in counted(c, g)}
     if verdicts & {*UNUSABLE}:
         return "partly usable"
     return "usable with care" if c.warnings or "weak" in verdicts else "usable"
@@ -68,13 +68,13 @@ def reasons(c: Calibration) -> tuple[str, ...]:
     """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
     if not c.converged:
         return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
-    counted = {v for g in c.groups for v in _counted(c, g)} & {"weak", *UNUSABLE}
+    verdicts = {v for g in c.groups for v in counted(c, g)} & {"weak", *UNUSABLE}
     # Standard deviations of a wrong model include its misfit, which a longer recording does not reduce.
     unusable, weak = ([], []) if c.wrong else ([*_named(c, *UNUSABLE)], [*_named(c, "weak")])
     rest = [w for w in c.warnings if w not in c.wrong]
     # Unobservable coefficients of a lens matter little if its projection is known well enough, so they come last.
-    directions = c.unobservable if counted else ()
-    first, last = (directions, ()) if "unobservable" in counted else ((), directions)
+    directions = c.unobservable if verdicts else ()
+    first, last = (directions, ()) if "unobservable" in verdicts else ((), directions)
     return tuple(dict.fromkeys([*c.wrong, *first, *unusable, *rest, *weak, *last]))
 
 
@@ -129,7 +129,7 @@ def tolerance(c: Calibration, name: str) -> float:
     return float(c.settings.get(name, getattr(Settings, name)))
 
 
-def _counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
+def counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
     """Verdicts of a group that contribute to the verdict on the result; one verdict for a lens, none for nuisance
     parameters."""
     if g.name in AUXILIARY:
@@ -166,7 +166,7 @@ def _more(c: Calibration) -> str:
 def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
     """Name with standard deviation, and verdict, of every component that contributes to the verdict on the result."""
     for g in c.groups:
-        verdicts = _counted(c, g)
+        verdicts = counted(c, g)
         if g.name in (lens := c.lenses.get(g.sensor, ())):
             if verdicts and g.name == lens[0]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]

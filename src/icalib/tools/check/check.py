@@ -23,7 +23,7 @@ from icalib.geometry import so3
 from icalib.pipeline import Progress, calibrate_measurements, measure
 from icalib.result import Calibration, ParameterGroup, SensorFit, joint_covariance
 from icalib.result.as_rig import rig_of_result
-from icalib.result.verdict import AUXILIARY, UNUSABLE, lens_verdict
+from icalib.result.verdict import AUXILIARY, UNUSABLE, counted
 from icalib.rig import Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.tools.comparison.compare import Comparison, Difference, compare_sides
@@ -155,14 +155,8 @@ def _fits_of_fixed(
 
 def _unusable(c: Calibration) -> list[str]:
     """Names of groups that are unusable; a lens is classified by the uncertainty of its projection."""
-    names = []
-    for g in c.groups:
-        if g.columns is None or g.name in AUXILIARY or g.sensor not in c.rig["sensors"] or g.mode == "prior":
-            continue
-        lens = g.name in c.lenses.get(g.sensor, ())
-        if {*UNUSABLE} & {*((lens_verdict(c, g.sensor),) if lens else g.verdict)}:
-            names.append(_block(c, g))
-    return list(dict.fromkeys(names))
+    groups = [g for g in c.groups if g.sensor in c.rig["sensors"] and {*UNUSABLE} & {*counted(c, g)}]
+    return list(dict.fromkeys(_block(c, g) for g in groups))
 
 
 def _fixed(c: Calibration) -> list[str]:
