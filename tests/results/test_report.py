@@ -29,6 +29,7 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
+from icalib.result.excess import excess, largest_dof
 from icalib.result.quantities import TURNS, chi2_words, dof_words, format_number, rows, rpy_deg
 from icalib.result.summary import calibration_yaml
 from icalib.sensors.camera.show import image_figures, projection_figures
@@ -326,18 +327,19 @@ def test_shown(value: float, words: str):
 
 
 @pytest.mark.parametrize(
-    ("count", "dof", "words"),
+    ("count", "dof", "chi2", "words"),
     [
-        (20000, 19800.5, "19800"),
-        (1794, 0.6, "at most 85 of 1794"),
-        (1794, -12.3, "at most 85 of 1794"),
-        (3, 1, "at most 3 of 3"),
+        (20000, 19800.5, 19800.5, ("1.00", "19800")),
+        (1188, -5.7, 2021.9, ("at least 20", "at most 103")),
+        (1794, 0.6, 0.1, ("at least 0.00078", "at most 128")),
+        (3, 1.0, 6.0, ("at least 2.0", "at most 3")),
     ],
 )
-def test_degrees_of_freedom_below_their_sampling_error_are_bounded(count: int, dof: float, words: str):
-    """Many residuals never stand beside no degree of freedom."""
-    fit = SensorFit("imu0", "bias walk", count, dof, 0.1)
-    assert dof_words(fit) == words and (chi2_words(fit) == "n/a") == words.startswith("at most")
+def test_few_degrees_of_freedom_are_bounded(count: int, dof: float, chi2: float, words: tuple[str, str]):
+    """Below the sampling error of the degrees of freedom, chi^2 has a lower bound; a warning has the same one."""
+    fit = SensorFit("imu0", "bias walk", count, dof, chi2)
+    assert (chi2_words(fit), dof_words(fit)) == words
+    assert excess(fit) == pytest.approx(1.0 if chi2 <= 2.0 * largest_dof(fit) else np.sqrt(chi2 / largest_dof(fit)))
 
 
 def test_numbers_and_thinning():

@@ -20,7 +20,6 @@ from icalib.result.verdict import NEXT, Usability
 
 LINE_EVERY_S = 30.0  # interval between progress lines if stderr is no terminal
 RESIDUALS = "Residuals: chi^2 per degree of freedom is 1 where noise is as stated; in brackets the degrees of freedom."
-NO_REDUNDANCY = "n/a: too few degrees of freedom are left to test this noise, so the stated one is used as it is."
 VERDICT_STYLES: dict[Usability, str] = {
     "usable": "bold green",
     "usable with care": "bold yellow",
@@ -86,8 +85,6 @@ def print_result(calibration: Calibration, folder: Path) -> None:
         console.print(
             f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}", markup=False
         )
-    if any(f.chi2_per_dof is None for f in calibration.fits):
-        console.print(f"  {NO_REDUNDANCY}", markup=False)
     for sentence in calibration.notes:
         console.print(f"Note: {sentence}", markup=False)
     console.print(f"Solver: {calibration.status}", markup=False)

@@ -25,11 +25,15 @@ def dof_known(fit: SensorFit) -> bool:
     return fit.dof > SAMPLED_DOF * np.sqrt(fit.count)
 
 
+def largest_dof(fit: SensorFit) -> float:
+    """Upper bound of the degrees of freedom, by their sampling error; at least 1."""
+    return max(min(max(fit.dof, 0.0) + SAMPLED_DOF * np.sqrt(fit.count), fit.count), 1.0)
+
+
 def excess(fit: SensorFit) -> float:
     """Ratio of residuals to the stated noise, sqrt(chi^2 / dof); a lower bound if not `dof_known`. 1 if chi^2 / dof is
     below `LARGE_CHI2`."""
-    dof = fit.dof if dof_known(fit) else max(fit.dof, 0.0) + SAMPLED_DOF * np.sqrt(fit.count)
-    chi2_per_dof = fit.chi2 / max(dof, 1.0)
+    chi2_per_dof = fit.chi2 / (fit.dof if dof_known(fit) else largest_dof(fit))
     return float(np.sqrt(chi2_per_dof)) if chi2_per_dof > LARGE_CHI2 else 1.0
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import floor, isfinite, log10, sqrt
+from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from icalib.geometry import euler
 from icalib.result.body_frame import in_body_frame
+from icalib.result.excess import largest_dof
 from icalib.result.relative import joint_covariance
 from icalib.result.verdict import counted, worst
 from icalib.rig import LENS
@@ -105,14 +106,15 @@ def format_number(value: float, digits: int = 2) -> str:
 
 
 def chi2_words(fit: SensorFit) -> str:
-    """Text of chi^2 per post-fit degree of freedom."""
-    return "n/a" if fit.chi2_per_dof is None else format_number(fit.chi2_per_dof, 3)
+    """Text of chi^2 per post-fit degree of freedom; a lower bound if their number is below its sampling error."""
+    if fit.chi2_per_dof is None:
+        return f"at least {format_number(fit.chi2 / largest_dof(fit))}"
+    return format_number(fit.chi2_per_dof, 3)
 
 
 def dof_words(fit: SensorFit) -> str:
-    """Text of the post-fit degrees of freedom; below their sampling error an upper bound, two such errors more."""
-    limit = max(fit.dof, 0.0) + 2.0 * sqrt(fit.count)
-    return f"{fit.dof:.0f}" if fit.chi2_per_dof is not None else f"at most {min(limit, fit.count):.0f} of {fit.count}"
+    """Text of the post-fit degrees of freedom; an upper bound if they are below their sampling error."""
+    return f"at most {largest_dof(fit):.0f}" if fit.chi2_per_dof is None else f"{fit.dof:.0f}"
 
 
 def rms_words(fit: SensorFit) -> str:
