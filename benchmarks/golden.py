@@ -19,13 +19,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 from golden_cases import CASES, ROOT
 
+from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
+from icalib.rig import Rig
 
 FOLDER = Path(__file__).resolve().parent / "golden"
 EQUAL = 1e-9
@@ -61,6 +64,11 @@ def run(name: str, data: Path) -> Record:
     """The second of two runs of a case."""
     rig, measurements = CASES[name](data)
     calibrate_measurements(rig, measurements)
+    return record_of(rig, measurements)
+
+
+def record_of(rig: Rig, measurements: Sequence[Measurements]) -> Record:
+    """Calibrates, and records the result."""
     visits: list[object] = []
     begun = time.process_time()
     result = calibrate_measurements(rig, measurements, on_visit=visits.append)

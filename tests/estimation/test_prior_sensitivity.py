@@ -8,16 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from icalib.errors import EstimationError
 from icalib.observability import prior_sensitivity as module
 from icalib.observability.prior_sensitivity import (
-    N_SIGN_DRAWS,
     directions_to_reset,
-    linear_prior_sensitivity,
     prior_sensitivity,
     project_to_guess,
     project_to_prior,
 )
+from icalib.optim.arrowhead import Factors
 from icalib.optim.state import Entry, State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -28,7 +26,7 @@ DRAWS = 2000
 @pytest.fixture
 def given(monkeypatch):
     """Two sensors; the data leave open a shift of both, and a mixture of height and time of one. What is left is
-    determined exactly: the answer to a move is the move."""
+    determined: the answer to a move is the move, and what `bend` makes of it."""
     entries: list[Entry] = [
         (s, n, "vector", size, True) for s in "ab" for n, size in (("translation", 3), ("time_offset", 1))
     ]
@@ -48,10 +46,25 @@ def given(monkeypatch):
     sigma = np.concatenate([SIGMA[b.name] for b in layout.free])
     monkeypatch.setattr(module, "given_priors", lambda _: priors)
     monkeypatch.setattr(module, "guess_sigma", lambda *_: sigma.copy())
-    monkeypatch.setattr(module, "minimise", lambda problem, state, *_: SimpleNamespace(state=state))
+    bend = np.zeros((8, 8))  # of the second coordinate of a by the others, quadratic, in tolerance units
+
+    def factors(outcome, at: State) -> Factors:
+        """The data show all that is at right angles to the fixed directions, but for the second coordinate of a less
+        a quadratic form of the others."""
+        x = np.concatenate([at.values[b.key] for b in layout.free]) / problem.tolerance
+        held = problem.fixed_directions
+        J = np.eye(8) - held @ held.T
+        J[1] = np.eye(8)[1] - 2.0 * bend @ x
+        pieces, nothing = (), np.zeros((0, 0))
+        information = J.T @ J / np.outer(problem.tolerance, problem.tolerance)
+        return Factors(pieces, [], 2, nothing, np.zeros((0, 9)), information, problem.tolerance, held)
+
+    monkeypatch.setattr(module, "_factors", factors)
     inputs = SimpleNamespace(is_sensor=lambda name: name in "ab", layout=layout)
-    outcome = SimpleNamespace(problem=problem, state=state, workspace=None)
-    return SimpleNamespace(inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors, outcome=outcome)
+    outcome = SimpleNamespace(problem=problem, state=state, workspace=None, converged=True, stopped_early=False)
+    return SimpleNamespace(
+        inputs=inputs, problem=problem, state=state, sigma=sigma, priors=priors, outcome=outcome, bend=bend
+    )
 
 
 def landed(given, rng) -> np.ndarray:
@@ -67,6 +80,12 @@ def landed(given, rng) -> np.ndarray:
         moved = given.state if moved is None else moved
         out.append(np.concatenate([moved.values[b.key] for b in given.problem.layout.free]))
     return np.array(out)
+
+
+def sensitivity(given, data: np.ndarray | None = None) -> np.ndarray:
+    """(n, 8) `prior_sensitivity` with no noise in the Jacobian."""
+    nothing = np.zeros((8, 8))
+    return prior_sensitivity(given.inputs, given.outcome, nothing if data is None else data, nothing)
 
 
 @pytest.mark.parametrize(("pull", "sigmas", "moves"), [(0.1, 1.0, True), (9.0, 1.9, False), (9.0, -2.1, True)])
@@ -88,9 +107,8 @@ def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull:
 def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bool):
     if weighed:
         given.priors.append(SimpleNamespace(block=given.problem.layout.free[0], sigma=np.array([0.1, 0.2, 0.05])))
-    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
-    assert 2 < len(shifts) <= 2 + N_SIGN_DRAWS  # two errors, and what both together make beyond their sum
-    np.testing.assert_allclose(shifts[2:], 0.0, atol=1e-12)
+    shifts = sensitivity(given)
+    np.testing.assert_allclose(shifts[2:], 0.0, atol=1e-9)
     drawn = np.cov(landed(given, np.random.default_rng(0)).T)
     expected, scale = shifts.T @ shifts, given.problem.tolerance
     np.testing.assert_allclose(
@@ -102,44 +120,53 @@ def test_the_shifts_have_the_covariance_of_where_guesses_land(given, weighed: bo
     assert expected[0, 4] == pytest.approx(expected[0, 0], rel=1e-9)
 
 
-def test_what_comes_of_two_errors_together_is_owed_too(given, monkeypatch):
-    def bent(problem, state, options, workspace):
-        values = {k: v.copy() for k, v in state.values.items()}
-        values["a", "translation"][1] += 7.0 * values["a", "translation"][0] * values["a", "translation"][2]
-        return SimpleNamespace(state=replace(state, values=values))
-
-    monkeypatch.setattr(module, "minimise", bent)
-    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
-    assert np.abs(shifts[:2, 1]).max() < 1e-12  # neither alone moves it
-    drawn = landed(given, np.random.default_rng(0))
-    product = 7.0 * drawn[:, 0] * drawn[:, 2]
-    assert (shifts[2:, 1] ** 2).sum() == pytest.approx(np.mean(product**2), rel=0.2)
+@pytest.mark.parametrize("a_third", [0.0, 4e-3])
+def test_what_is_of_second_order_is_owed_too(given, a_third: float):
+    """A product of two errors, and a square."""
+    given.bend[0, 2], given.bend[0, 0] = 8e-3, a_third
+    given.bend[:] = 0.5 * (given.bend + given.bend.T)
+    shifts = sensitivity(given)
+    assert np.abs(shifts[:2, 1]).max() < 1e-9  # neither alone moves it, to first order
+    drawn = landed(given, np.random.default_rng(0)) / given.problem.tolerance
+    bent = np.einsum("ni,ij,nj->n", drawn, given.bend, drawn) * given.problem.tolerance[1]
+    assert (shifts[2:, 1] ** 2).sum() == pytest.approx(np.mean(bent**2), rel=0.2)
 
 
-def test_nothing_is_tried_out_where_the_guess_alone_leaves_all_open(given, monkeypatch):
-    given.problem.fixed_directions = np.eye(8)
-    monkeypatch.setattr(module, "minimise", None)
-    shifts = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
-    np.testing.assert_allclose(np.sqrt((shifts**2).sum(axis=0)), given.sigma)
+def test_signs_and_basis_of_the_fixed_directions_do_not_matter(given):
+    given.bend[0, 2] = given.bend[2, 0] = 4e-3
+    given.bend[3, 3] = 2e-3
+    data = np.diag(np.arange(8.0)) * 1e-3
+    given.inputs.is_sensor = lambda name: name == "b"
+    expected = sensitivity(given, data)
+    turn = np.array([[0.6, 0.8], [0.8, -0.6]])
+    given.problem.fixed_directions = given.problem.fixed_directions @ turn
+    found = sensitivity(given, data)
+    np.testing.assert_allclose(found.T @ found, expected.T @ expected, rtol=1e-7, atol=1e-12)
 
 
-def test_in_proportion_only_what_is_held_moves(given, monkeypatch):
-    nothing = np.zeros((8, 8))
-    expected = prior_sensitivity(given.inputs, given.outcome, nothing)[:2]
-    monkeypatch.setattr(module, "minimise", None)
-    np.testing.assert_allclose(linear_prior_sensitivity(given.inputs, given.outcome, nothing), expected, atol=1e-12)
+def test_noise_in_the_jacobian_is_no_response(given, monkeypatch):
+    expected = sensitivity(given)
+    noise, before = np.full((8, 8), 0.01), module._factors
+
+    def noisy(outcome, at: State) -> Factors:
+        factors, t = before(outcome, at), given.problem.tolerance
+        return replace(factors, information=factors.information + noise / np.outer(t, t))
+
+    monkeypatch.setattr(module, "_factors", noisy)
+    assert not np.allclose(sensitivity(given), expected)
+    found = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)), noise)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
-def test_a_way_along_which_nothing_can_be_solved_is_made_shorter(given, monkeypatch):
-    def short_only(problem, state, options, workspace):
-        if np.abs(state.values["b", "translation"]).max() > 0.02:
-            raise EstimationError("too far")
-        return SimpleNamespace(state=state)
-
-    expected = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
-    monkeypatch.setattr(module, "minimise", short_only)
-    found = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)))
-    np.testing.assert_allclose(found, expected, atol=1e-12)
+@pytest.mark.parametrize("why", ["all are fixed", "the estimate failed"])
+def test_without_a_response_only_the_fixed_directions_move(given, monkeypatch, why: str):
+    if why == "all are fixed":
+        given.problem.fixed_directions = np.eye(8)
+    given.outcome.converged = why == "all are fixed"
+    monkeypatch.setattr(module, "_factors", None)
+    shifts, held = sensitivity(given), given.problem.fixed_directions * given.problem.tolerance[:, None]
+    in_tolerances = given.problem.fixed_directions.T * (given.sigma / given.problem.tolerance)
+    np.testing.assert_allclose(shifts.T @ shifts, held @ in_tolerances @ in_tolerances.T @ held.T, atol=1e-12)
 
 
 def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
@@ -147,7 +174,7 @@ def test_what_nobody_guessed_moves_no_further_than_the_data_leave_open(given):
     data = np.diag(np.full(8, 5e-3))
     data[0, 0] = 0.0
     given.problem.fixed_directions = np.eye(8)[:, [0, 1]]  # of a, which is no sensor now
-    shifts = prior_sensitivity(given.inputs, given.outcome, data)
+    shifts = sensitivity(given, data)
     width = np.sqrt((shifts**2).sum(axis=0)) / given.problem.tolerance
     assert width[0] == pytest.approx(module.UNGUESSED_SIGMA / 5e-3)
-    assert width[1] == pytest.approx(min(module.UNGUESSED_SIGMA / 5e-3, 1.0 / np.sqrt(5e-3)))
+    assert width[1] == pytest.approx(1.0 / np.sqrt((5e-3 / module.UNGUESSED_SIGMA) ** 2 + 5e-3))

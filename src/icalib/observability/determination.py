@@ -40,7 +40,6 @@ from icalib.estimate.residual_statistics.inflation import MIN_INFLATION, inflati
 from icalib.estimate.residual_statistics.jacobian_noise import Spurious, spurious_information
 from icalib.observability.prior_sensitivity import (
     directions_to_reset,
-    linear_prior_sensitivity,
     prior_sensitivity,
     project_to_guess,
     project_to_prior,
@@ -142,9 +141,7 @@ def determine(
     fixed_directions, shifts = np.zeros((inputs.layout.size, 0)), np.zeros((0, inputs.layout.size))
     if result.problem.fixed_directions.size:
         fixed_directions = result.problem.fixed_directions
-        # After a failed solve, re-solving for the sensitivity might fail, too.
-        sensitivity = prior_sensitivity if _is_usable(result.outcome) else linear_prior_sensitivity
-        shifts = sensitivity(inputs, result.outcome, directions.data)
+        shifts = prior_sensitivity(inputs, result.outcome, directions.data, directions.noise)
     # free the workspace: nothing is solved in it any more
     result = replace(result, outcome=replace(result.outcome, workspace=None))
     return Determined(result, directions.data, directions.noise, fixed_directions, shifts, search.inflation)

@@ -1,8 +1,9 @@
 """Unobservable directions: the prior mean at which they are fixed, and the consider covariance of all other parameters.
 
 A fixed direction has the value of the guesses of all parameters that it moves. Independent errors of these guesses give
-the prior covariance of the fixed directions. Each principal axis is moved by one standard deviation, and all other
-parameters are solved again. Their shift is the sensitivity to the fixed directions.
+the prior covariance of the fixed directions. The response of all other parameters is that of the normal equations at
+the solution (implicit function theorem). Its derivative gives the second-order terms: on a plane the baseline of wheels
+changes with the square of their roll.
 """
 
 from __future__ import annotations
@@ -10,18 +11,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import eigh
 
-from icalib.errors import EstimationError
-from icalib.estimate.estimate import EARLY_DECREASE
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.guess_priors import guess_sigma
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.estimate.problem.tolerances import UNGUESSED_SIGMA
 from icalib.geometry import planes, so3
-from icalib.optim.calib_block import UNOBSERVABLE_BELOW
+from icalib.optim.arrowhead import Factors, solve
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.sensors.sensor import ROTATION
 
@@ -29,12 +27,8 @@ from icalib.sensors.sensor import ROTATION
 WEAKLY_CONSTRAINED_BELOW = 0.25
 MAX_PRIOR_SIGMAS = 2.0  # standard deviations of the guess; a direction farther from the guess is reset to it
 MOVED_ABOVE = 0.1  # entry of a unit direction above which the direction moves that parameter
-MAJORITY_SHARE = 0.5  # share of the squared length of a direction
 MIN_RESET = 0.05  # of the prior uncertainty of the guess; a shorter reset is skipped
-N_SIGN_DRAWS = (
-    4  # random sign combinations of the errors of the guess, to sample how far their effects are not additive
-)
-MAX_HALVINGS = 4  # most halvings of a move that is too long to be solved
+SHORT_STEP = 0.1  # standard deviations of the guess: half the step of the central differences of the response
 
 
 def directions_to_reset(
@@ -84,50 +78,72 @@ def project_to_prior(
     return _moved(problem, state, step / problem.tolerance)
 
 
-def prior_sensitivity(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(n, B) changes of the calibration parameters, in their units, for errors of the guess along the m fixed
-    directions.
+def prior_sensitivity(inputs: Inputs, outcome: Outcome, data: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """(n, B) changes of the calibration parameters, in their units, whose outer products add up to the consider
+    covariance of the m fixed directions.
 
-    The first m rows are those of the independent errors, one standard deviation each. At most N_SIGN_DRAWS more rows
-    hold the deviation of random sign combinations from the sum. The outer products of all rows add up to the consider
-    covariance. data (B, B): information of the data alone, in tolerance units. Uses the workspace of `outcome`.
+    The first m rows are the linear responses to independent errors of the guess, one standard deviation each. The
+    others hold the mean and the covariance of the second-order terms for Gaussian errors (Athans, Wishner and Bertolini
+    1968). The sum does not depend on signs and choice of the axes. data, noise (B, B): information of the data alone,
+    and what noise in the Jacobian adds, in tolerance units. Overwrites the workspace of `outcome`. A failed estimate,
+    or one with no other direction, has no response: only the fixed directions themselves move.
     """
+    problem, state = outcome.problem, outcome.state
     errors = _guess_errors(inputs, outcome, data)
-    if _make_all_unobservable(inputs, outcome.problem, errors):
-        return linear_prior_sensitivity(inputs, outcome, data)
-    changes = np.array([_response(outcome, error) for error in errors.T])
-    signs = np.random.default_rng(0).choice((-1.0, 1.0), (N_SIGN_DRAWS, errors.shape[1]))
-    # With few errors the sign combinations repeat: each is solved once and weighted by its count.
-    signs, counts = np.unique(signs, axis=0, return_counts=True)
-    deviations = np.array([_response(outcome, errors @ s) - s @ changes for s in signs])
-    return np.vstack([changes, np.sqrt(counts / N_SIGN_DRAWS)[:, None] * deviations])
+    m, is_usable = errors.shape[1], outcome.converged or outcome.stopped_early
+    if not is_usable or m == len(problem.layout.essential):
+        return problem.tolerance * errors.T
+    factors = _factors(outcome, state)
+    first, second = _response(factors, noise, errors), np.zeros((m, len(errors), m))
+    chain = factors.back(np.vstack([first, np.zeros((1, m))]), [np.zeros((n, m)) for n in factors.rows()])
+    for k in range(m):
+        for sign in (1.0, -1.0):
+            step = sign * SHORT_STEP * np.ascontiguousarray(chain[:, :, k]), sign * SHORT_STEP * first[:, k]
+            end = _factors(outcome, state.retract(problem.layout, *step))
+            second[k] += sign * _response(end, noise, errors) / (2.0 * SHORT_STEP)
+    second = 0.5 * (second + second.transpose(2, 1, 0))
+    return np.vstack([first.T, 0.5 * np.einsum("kbk->b", second), *np.sqrt(0.5) * second.transpose(0, 2, 1)])
 
 
-def linear_prior_sensitivity(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
-    """(m, B) as `prior_sensitivity`, but only the fixed directions themselves move: nothing is solved."""
-    return outcome.problem.tolerance * _guess_errors(inputs, outcome, data).T
+def _factors(outcome: Outcome, state: State) -> Factors:
+    """The factorised normal equations of `outcome` at `state`; overwrites its workspace."""
+    problem, pieces = outcome.problem, outcome.workspace or outcome.problem.pieces()
+    problem.linearise(state, pieces, problem.residuals(), curved=True)
+    return solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).factors
+
+
+def _response(factors: Factors, noise: np.ndarray, errors: np.ndarray) -> np.ndarray:
+    """(B, m) change of all calibration parameters, in their units, with `errors` (B, m) along the fixed directions, by
+    the implicit function theorem. noise (B, B): information that noise in the Jacobian adds; both in tolerance
+    units."""
+    t = factors.tolerance[:, None]
+    known = t * factors.information * t.T - noise
+    return t * (errors - restricted_inverse(known, factors.fixed_directions) @ (known @ errors))
 
 
 def _guess_errors(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:
     """(B, m) independent errors of the guess along the fixed directions, one standard deviation each, in tolerance
     units.
 
-    Directions mostly of walls, boards and frames, which have no guess, are limited to the standard deviation that the
-    information `data` (B, B) allows. Unlimited, a board would be rotated by any angle against gravity, with an absurd
+    Walls, boards and frames have no guess. The more a direction consists of them, the more the information `data` (B,
+    B) limits its standard deviation. Unlimited, a board would be rotated by any angle against gravity, with an absurd
     accelerometer bias.
     """
-    problem = outcome.problem
-    # NumPy's divide and conquer has failed on many nearly equal eigenvalues.
-    values, turn = eigh(_prior_covariance(inputs, problem, outcome.state, problem.fixed_directions), driver="evr")
-    axes = problem.fixed_directions @ turn
-    sigma = np.sqrt(np.clip(values, 0.0, None))
+    problem, fixed_directions = outcome.problem, outcome.problem.fixed_directions
     of_sensors = [b.columns for b in problem.layout.free if inputs.is_sensor(b.sensor)]
-    guessed = np.concatenate([np.arange(0), *of_sensors])
-    for k, axis in enumerate(axes.T):
-        information = float(np.clip(axis @ data @ axis, 0.0, UNOBSERVABLE_BELOW))
-        if float((axis[guessed] ** 2).sum()) < MAJORITY_SHARE and sigma[k] ** 2 * information > 1.0:
-            sigma[k] = 1.0 / np.sqrt(information)
-    return axes * sigma
+    unguessed = np.delete(fixed_directions, np.concatenate([np.arange(0), *of_sensors]), axis=0)
+    share = _root(unguessed.T @ unguessed, 1.0)
+    limit = _root(fixed_directions.T @ data @ fixed_directions, UNOBSERVABLE_BELOW) @ share
+    root = _root(_prior_covariance(inputs, problem, outcome.state, fixed_directions), np.inf)
+    limited = np.linalg.inv(np.eye(len(root)) + root @ limit.T @ limit @ root)
+    return fixed_directions @ root @ _root(limited, 1.0)
+
+
+def _root(covariance: np.ndarray, largest: float) -> np.ndarray:
+    """(m, m) symmetric root of `covariance` (m, m), whose eigenvalues are clipped to 0 and `largest`."""
+    # NumPy's divide and conquer has failed on many nearly equal eigenvalues.
+    values, vectors = eigh(covariance, driver="evr")
+    return vectors * np.sqrt(np.clip(values, 0.0, largest)) @ vectors.T
 
 
 def _prior_covariance(inputs: Inputs, problem: Problem, state: State, fixed_directions: np.ndarray) -> np.ndarray:
@@ -145,30 +161,6 @@ def _prior_covariance(inputs: Inputs, problem: Problem, state: State, fixed_dire
         sigma[block.columns] = np.minimum(sigma[block.columns], UNGUESSED_SIGMA)
     scaled = fixed_directions * (sigma / problem.tolerance)[:, None]
     return scaled.T @ scaled
-
-
-def _make_all_unobservable(inputs: Inputs, problem: Problem, errors: np.ndarray) -> bool:
-    """Whether the `errors` (B, m) of the guess alone make every parameter of every sensor unobservable."""
-    variance = (errors**2).sum(axis=1)
-    return all(
-        (variance[b.columns] > 1.0 / UNOBSERVABLE_BELOW).all()
-        for b in problem.layout.free
-        if inputs.is_sensor(b.sensor)
-    )
-
-
-def _response(outcome: Outcome, error: np.ndarray) -> np.ndarray:
-    """(B,) change of the calibration parameters, in their units, if the guess moves by `error` (B,; tolerance units)
-    along the fixed directions. If that move is too long to be solved, a shorter one is solved and scaled up."""
-    problem, state = outcome.problem, outcome.state
-    for k in range(MAX_HALVINGS):
-        moved = _moved(problem, state, error / 2**k)
-        try:
-            end = minimise(problem, moved, SolverOptions(EARLY_DECREASE), outcome.workspace)
-        except EstimationError:
-            continue
-        return 2**k * calib_difference(problem, end.state, state)
-    return problem.tolerance * error
 
 
 def _has_priors(inputs: Inputs, fixed_directions: np.ndarray) -> bool:
