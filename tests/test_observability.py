@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from icalib.observability.words import Observability, observe
+from icalib.observability.words import Observability, observe, sparse_basis
 from icalib.result import Verdict
 from icalib.rig import ParameterSpec
 from icalib.rig.kinds import ALL_SPECS
@@ -99,3 +99,12 @@ def test_above_ten_tolerances_the_larger_part_of_the_variance_decides():
     found.fixed_directions = np.array([0.1, 0.1, 0.1, 0.1, 0.0, 0.98])[:, None]
     seen = observe(found, names, specs_of(names))
     assert verdicts_of(seen) == ("unobservable",) * 2 + ("too uncertain",) * 2 + ("unobservable",) * 2
+
+
+def test_the_basis_of_named_directions_depends_on_their_span_alone():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        directions = np.linalg.qr(rng.standard_normal((9, 3)))[0]
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        a, b = sparse_basis(directions), sparse_basis(directions @ turn)
+        np.testing.assert_allclose(np.abs(a.T @ b), np.eye(3), atol=1e-6)

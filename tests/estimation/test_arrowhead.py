@@ -5,7 +5,7 @@ import pytest
 
 from icalib.optim import arrowhead
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
-from icalib.optim.calib_block import UNOBSERVABLE_BELOW, calib_step
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, calib_draws, calib_step
 from icalib.optim.state import KEYFRAME_DIM
 
 
@@ -169,6 +169,18 @@ def test_unobservable_directions_stay_and_the_rest_is_solved(dense, n_keyframes)
     o, step = KEYFRAME_DIM * n_keyframes, flat(solution)
     np.testing.assert_allclose((H @ step + g)[:o], 0.0, atol=1e-9)  # the chain follows the held parameters
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-8)
+
+
+def test_draws_do_not_depend_on_the_basis_of_an_eigenspace():
+    """All eigenvalues are equal but for rounding, which chooses the eigenvectors."""
+    rng = np.random.default_rng(0)
+    noise, white = rng.standard_normal((6, 6)), rng.standard_normal((6, 4))
+    tolerance, fixed = np.ones(6), np.linalg.qr(rng.standard_normal((6, 2)))[0]
+    turned = fixed @ np.array([[0.6, 0.8], [0.8, -0.6]])
+    expected = calib_draws(4.0 * np.eye(6), tolerance, fixed, white)
+    found = calib_draws(4.0 * np.eye(6) + 1e-13 * (noise + noise.T), tolerance, turned, white)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(expected, 0.5 * (white - fixed @ fixed.T @ white), atol=1e-12)
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])

@@ -12,6 +12,7 @@ from icalib.data.measurements import ImuStream, Measurements
 from icalib.data.stamps.clocks import usual_step
 from icalib.rig import ImuNoise, Rig
 
+SAME_INSTANT_S = 1e-6  # s: on a common grid of stamps, rounding must not decide which of two instants is nearer
 MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both, seconds and periods, is a gap
 # Correlation time of rate and specific force within a gap. Their unknown variation there has their variance over the
 # recording.

@@ -16,7 +16,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import SAME_INSTANT_S, ImuData
 from icalib.motion.integration import bias_of, corrected, readings_of
 from icalib.motion.integration_step import (
     AT_INTRINSICS,
@@ -81,10 +81,10 @@ class VelocityDerivatives(NamedTuple):
 def assign_keyframes(scheme: Scheme, keyframes: np.ndarray, times: np.ndarray, forwards: bool = False) -> np.ndarray:
     """Keyframe (n,) of each time: the nearest one. For `pose`, or if motion is propagated `forwards` only (see
     `ImuData`), the one before."""
-    after = np.clip(np.searchsorted(keyframes, times, side="right"), 1, len(keyframes) - 1)
+    after = np.clip(np.searchsorted(keyframes, times + SAME_INSTANT_S), 1, len(keyframes) - 1)
     if scheme == "pose" or forwards:
         return after - 1
-    return after - (times - keyframes[after - 1] < keyframes[after] - times)
+    return after - (times - keyframes[after - 1] < keyframes[after] - times + SAME_INSTANT_S)
 
 
 @njit(cache=True, nogil=True)

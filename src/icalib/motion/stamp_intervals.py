@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.motion.imu_data import ImuData, clear_of
+from icalib.motion.imu_data import SAME_INSTANT_S, ImuData, clear_of
 
 MAX_INTERVAL_S = 0.5  # the approximations within an interval hold up to this length
 
@@ -30,7 +30,8 @@ def choose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...
     first after the keyframe.
     """
     after = np.clip(np.searchsorted(times, keyframes), 1, len(times) - 1)
-    near = after if imu.forwards else after - (keyframes - times[after - 1] < times[after] - keyframes)
+    is_before = keyframes - times[after - 1] < times[after] - keyframes + SAME_INSTANT_S
+    near = after if imu.forwards else after - is_before
     a, b = times[near[:-1]], times[near[1:]]
     good = (a < b) & _usable(imu, a, b)
     good[np.array(starts[1:], dtype=np.int64) - 1] = False

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import qr
 
 from icalib.observability.determination import Determined
 from icalib.result import Verdict
@@ -68,9 +69,9 @@ def observe(
 
 def sparse_basis(directions: np.ndarray, rounds: int = 50) -> np.ndarray:
     """(B, m) basis of the span of the orthonormal `directions` (B, m), rotated so that each column has few large
-    entries (varimax, Kaiser 1958)."""
+    entries (varimax, Kaiser 1958). It begins at a basis that depends on the span alone."""
     n, m = directions.shape if directions.size else (len(directions), 0)
-    turn = np.eye(m)
+    turn = qr(directions.T, pivoting=True)[0] if m else np.eye(0)
     for _ in range(rounds if m > 1 else 0):
         L = directions @ turn
         U, _, Vt = np.linalg.svd(directions.T @ (L**3 - L * (L**2).mean(axis=0)))

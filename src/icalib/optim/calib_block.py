@@ -77,7 +77,8 @@ def calib_draws(
     information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, white: np.ndarray
 ) -> np.ndarray:
     """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
-    that `calib_step` fixes are zero."""
+    that `calib_step` fixes are zero. The root of the covariance is symmetric: signs of eigenvectors do not matter."""
     free, values, vectors = _directions(information, tolerance, fixed_directions)
     scaled = np.where(values > UNOBSERVABLE_BELOW, 1.0 / np.sqrt(np.maximum(values, UNOBSERVABLE_BELOW)), 0.0)
-    return tolerance[:, None] * (free @ (vectors @ (scaled[:, None] * white[: len(values)])))
+    axes = free @ vectors
+    return tolerance[:, None] * (axes @ (scaled[:, None] * (axes.T @ white)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import SAME_INSTANT_S, ImuData
 
 SMOOTHING_HALF_WINDOW_S = 0.5  # s on both sides of an instant: the gyroscope drifts little over it
 
@@ -40,7 +40,7 @@ class GyroRotation:
         """Rotations R_any_imu (n, 3, 3) at times `to` (n,) s, from known ones (m, 3, 3) at increasing t (m,) s. Each is
         propagated from the nearest known one by the gyroscope."""
         after = np.clip(np.searchsorted(t, to), 1, len(t) - 1)
-        near = after - (to - t[after - 1] < t[after] - to)
+        near = after - (to - t[after - 1] < t[after] - to + SAME_INSTANT_S)
         start = self.at(t)[near]
         return rotation[near] @ start.transpose(0, 2, 1) @ self.at(to)
 
@@ -55,9 +55,8 @@ class GyroRotation:
         start = rotation @ R_start_imu.transpose(0, 2, 1)
         total = np.concatenate([np.zeros((1, 3, 3)), np.cumsum(start, axis=0)])
         part = np.searchsorted([gap for gap, _ in self.imu.gaps], t)
-        low = np.maximum(np.searchsorted(t, t - SMOOTHING_HALF_WINDOW_S), np.searchsorted(part, part))
-        high = np.minimum(
-            np.searchsorted(t, t + SMOOTHING_HALF_WINDOW_S, side="right"), np.searchsorted(part, part, side="right")
-        )
+        half = SMOOTHING_HALF_WINDOW_S + SAME_INSTANT_S
+        low = np.maximum(np.searchsorted(t, t - half), np.searchsorted(part, part))
+        high = np.minimum(np.searchsorted(t, t + half), np.searchsorted(part, part, side="right"))
         U, _, Vt = np.linalg.svd(total[high] - total[low])
         return U @ Vt @ R_start_imu

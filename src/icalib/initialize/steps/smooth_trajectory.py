@@ -11,6 +11,7 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import tmul3
 from icalib.initialize.steps.rate_windows import rotation_noise
+from icalib.motion.imu_data import SAME_INSTANT_S
 
 MIN_HALF_WINDOW_S = 0.1  # s: half of the smallest window
 MIN_HALF_WINDOW_STEPS = 3.2  # the same in steps between poses: seven poses for three coefficients
@@ -56,7 +57,7 @@ def smooth_trajectory(
     """Smooths poses R (n, 3, 3), p (n, 3) at increasing t (n,) s, and evaluates them at `at` (m,) s. Needs
     MIN_PARABOLA_POSES poses. narrow: uses the smallest window, which keeps all of the motion and more of the noise."""
     half = _min_half_window(t) if narrow else _half_window(t, R, p)
-    first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
+    first, last = np.searchsorted(t, at - half - SAME_INSTANT_S), np.searchsorted(t, at + half + SAME_INSTANT_S)
     few = last - first < MIN_PARABOLA_POSES
     middle = np.clip(np.searchsorted(t, at) - MIN_PARABOLA_POSES // 2, 0, len(t) - MIN_PARABOLA_POSES)
     first, last = np.where(few, middle, first), np.where(few, middle + MIN_PARABOLA_POSES, last)
@@ -88,7 +89,7 @@ def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
     at = at[np.linspace(0, len(at) - 1, min(len(at), SAMPLED_INSTANTS)).astype(int)]
     slopes = []
     for half in (h, 2.0 * h):
-        first, last = np.searchsorted(t, at - half), np.searchsorted(t, at + half)
+        first, last = np.searchsorted(t, at - half - SAME_INSTANT_S), np.searchsorted(t, at + half + SAME_INSTANT_S)
         full = last - first >= MIN_PARABOLA_POSES
         fitted = np.zeros((len(at), 3, 6))
         reference = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
