@@ -15,7 +15,7 @@ from icalib.observability.prior_sensitivity import (
     project_to_guess,
     project_to_prior,
 )
-from icalib.optim.arrowhead import Factors
+from icalib.optim.arrowhead import Factors, NotDefiniteError
 from icalib.optim.state import Entry, State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -156,6 +156,21 @@ def test_noise_in_the_jacobian_is_no_response(given, monkeypatch):
     assert not np.allclose(sensitivity(given), expected)
     found = prior_sensitivity(given.inputs, given.outcome, np.zeros((8, 8)), noise)
     np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_a_step_along_which_nothing_can_be_solved_leaves_the_linear_response(given, monkeypatch):
+    given.bend[0, 2] = given.bend[2, 0] = 4e-3
+    expected, before = sensitivity(given), module._factors
+
+    def at_the_solution(outcome, at: State) -> Factors:
+        if at is not outcome.state:
+            raise NotDefiniteError("too far")
+        return before(outcome, at)
+
+    monkeypatch.setattr(module, "_factors", at_the_solution)
+    found = sensitivity(given)
+    np.testing.assert_allclose(found[:2], expected[:2], atol=1e-12)
+    assert not found[2:].any()
 
 
 @pytest.mark.parametrize("why", ["all are fixed", "the estimate failed"])

@@ -8,6 +8,8 @@ changes with the square of their roll.
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 from scipy.linalg import eigh
 
@@ -18,7 +20,7 @@ from icalib.estimate.problem.outcome import Outcome
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.tolerances import UNGUESSED_SIGMA
 from icalib.geometry import planes, so3
-from icalib.optim.arrowhead import Factors, solve
+from icalib.optim.arrowhead import Factors, NotDefiniteError, solve
 from icalib.optim.calib_block import UNOBSERVABLE_BELOW, restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.sensors.sensor import ROTATION
@@ -97,10 +99,11 @@ def prior_sensitivity(inputs: Inputs, outcome: Outcome, data: np.ndarray, noise:
     first, second = _response(factors, noise, errors), np.zeros((m, len(errors), m))
     chain = factors.back(np.vstack([first, np.zeros((1, m))]), [np.zeros((n, m)) for n in factors.rows()])
     for k in range(m):
-        for sign in (1.0, -1.0):
-            step = sign * SHORT_STEP * np.ascontiguousarray(chain[:, :, k]), sign * SHORT_STEP * first[:, k]
-            end = _factors(outcome, state.retract(problem.layout, *step))
-            second[k] += sign * _response(end, noise, errors) / (2.0 * SHORT_STEP)
+        step = SHORT_STEP * np.ascontiguousarray(chain[:, :, k]), SHORT_STEP * first[:, k]
+        ends = (state.retract(problem.layout, sign * step[0], sign * step[1]) for sign in (1.0, -1.0))
+        with suppress(NotDefiniteError):  # no second-order terms where even a short step is too long
+            up, down = (_response(_factors(outcome, end), noise, errors) for end in ends)
+            second[k] = (up - down) / (2.0 * SHORT_STEP)
     second = 0.5 * (second + second.transpose(2, 1, 0))
     return np.vstack([first.T, 0.5 * np.einsum("kbk->b", second), *np.sqrt(0.5) * second.transpose(0, 2, 1)])
 
