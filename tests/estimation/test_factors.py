@@ -25,6 +25,7 @@ import icalib.sensors
 from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
+from icalib.model.bodies import SIZE
 from icalib.motion.factor import output_at
 from icalib.motion.poses import poses_at
 from icalib.motion.sweep import EstimatedMotion
@@ -67,11 +68,19 @@ def white(residual):
     return lambda at: (residual(at), np.eye(len(residual(at))))
 
 
-def imu_sample(unlike, setup_of, imu_free):
+def in_unit(setup):
+    """The setup with the size of the target as the unit of length of its motion, 1.3 m."""
+    values = setup.state.values | {SIZE: np.array([1.3])}
+    return replace(setup, imu=replace(setup.imu, unit=SIZE), state=replace(setup.state, values=values))
+
+
+def imu_sample(unlike, setup_of, imu_free, unit=False):
     """Preintegrated at another state, so that the corrections by bias and intrinsics are not zero."""
-    setup = setup_of(unlike, imu_free=imu_free)
+    setup = setup_of(unlike, imu_free=imu_free, size=unit)
+    setup = in_unit(setup) if unit else setup
     columns = setup.layout.columns("imu0", "intrinsics")
-    factor = ImuFactor.build(setup.imu, setup.state, 9.81, columns[columns >= 0])
+    columns = np.concatenate([columns[columns >= 0], setup.imu.unit_columns(setup.layout)])
+    factor = ImuFactor.build(setup.imu, setup.state, 9.81, columns)
     state = setup.perturbed(np.random.default_rng(0), 0.1)
 
     def residual(at):
@@ -440,10 +449,12 @@ def with_wheels(setup, kind="pair"):
 
 
 def wheel_sample(
-    unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair", restarts=False
-):
-    setup = with_wheels(setup_of(unlike, imu_free=imu_free), kind)
+    unlike, setup_of, factor, imu_free=False, rate_hz=70.0, loss="none", curved=False, kind="pair", restarts=False,
+    unit=False,
+):  # fmt: skip
+    setup = with_wheels(setup_of(unlike, imu_free=imu_free, size=unit), kind)
     setup = with_two_clocks(setup) if restarts else setup
+    setup = in_unit(setup) if unit else setup
     rng = np.random.default_rng(4)
     # The last stamps lie beyond the IMU's recording.
     seconds = np.arange(0.0, setup.imu.seconds[-1], 1.0 / rate_hz)
@@ -576,6 +587,8 @@ def position_sample(
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
+    "imu, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False, unit=True)),
+    "imu, intrinsics, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True, unit=True)),
     "radtan, inertial": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0)),
     "radtan, kinematic, intrinsics": (
         "CornerFactor",
@@ -663,6 +676,18 @@ SAMPLES = {
     "steered, huber, curved": (
         "IncrementFactor",
         lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, kind="steered"),
+    ),
+    "wheels, unit of length": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, loss="huber", curved=True, unit=True),
+    ),
+    "steered, unit of length": (
+        "IncrementFactor",
+        lambda u, s, f: wheel_sample(u, s, IncrementFactor, True, kind="steered", unit=True),
+    ),
+    "planar poses, unit of length": (
+        "RelativePoseFactor",
+        lambda u, s, f: wheel_sample(u, s, RelativePoseFactor, unit=True),
     ),
     "wheels, clock that restarts": (
         "IncrementFactor",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from icalib.model.bodies import SIZE
 from icalib.motion.integration import Increment, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
 from icalib.optim.arrowhead import make_pieces
@@ -78,6 +79,22 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
         np.testing.assert_allclose(factor.increments.W[k] @ P @ factor.increments.W[k].T, np.eye(15), rtol=0, atol=1e-9)
         assert (np.triu(factor.increments.W[k], 1) == 0).all()
         np.testing.assert_allclose(factor.increments.J[k, :, :6], J, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("scale", [0.8, 1.3])
+def test_an_assumed_motion_that_is_larger_in_a_larger_unit_has_the_same_residuals(setup, scale):
+    """Noise in metres would prefer the smaller one."""
+    imu = replace(setup.imu, gyro=np.zeros_like(setup.imu.gyro), accel=np.zeros_like(setup.imu.accel), unit=SIZE)
+    values = setup.state.values | {SIZE: np.ones(1), ("imu0", "intrinsics"): np.zeros(24)}
+    state = replace(setup.perturbed(np.random.default_rng(3)), values=values)
+    factor = ImuFactor.build(imu, state, 0.0, np.full(1, -1))
+    size = {"position": scale * state.position, "velocity": scale * state.velocity}
+    bias = state.bias * np.repeat([1.0, scale], 3)
+    scaled = replace(state, **size, bias=bias, values=state.values | {SIZE: np.array([scale])})
+    _, expected = whitened(factor, setup, state)
+    _, found = whitened(factor, setup, scaled)
+    assert np.abs(expected).max() > 1.0
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max())
 
 
 def test_corrections_by_bias_and_intrinsics_are_right_to_first_order(factor, setup):

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from icalib.data.joining import Part
 from icalib.data.measurements import ImuStream, Measurements
 from icalib.data.stamps.clocks import usual_step
-from icalib.rig import ImuNoise, Rig
+from icalib.geometry.targets.base import BOARD
+from icalib.optim.state import Key, Layout, State
+from icalib.rig import ImuNoise, Rig, scene
 
 SAME_INSTANT_S = 1e-6  # s: on a common grid of stamps, rounding must not decide which of two instants is nearer
 MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both, seconds and periods, is a gap
@@ -40,6 +42,10 @@ class ImuData:
     (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where nothing is known.
     forwards: True if biases of a keyframe apply until the next one, so that motion is propagated forwards only. This is
     so if the readings are an assumption on the motion, whose biases change much between keyframes.
+
+    unit: parameter whose value is the unit of length of an assumed motion: the scale of the sensor that shows the
+    motion; None for metres. Noise in metres would pull every length towards zero, because residuals of a shorter motion
+    are smaller.
     """
 
     name: str
@@ -51,6 +57,17 @@ class ImuData:
     gaps: tuple[tuple[float, float], ...]
     seams: tuple[tuple[float, float], ...] = ()
     forwards: bool = False
+    unit: Key | None = None
+
+    def unit_length(self, state: State) -> float:
+        """The unit of length [m] at `state`."""
+        return 1.0 if self.unit is None else float(state.values[self.unit][0])
+
+    def unit_columns(self, layout: Layout) -> np.ndarray:
+        """Calibration column (1,) of the unit of length, -1 if it is fixed; (0,) for metres."""
+        if self.unit is None:
+            return np.zeros(0, dtype=np.int64)
+        return layout.columns(*self.unit) if layout.has(*self.unit) else np.full(1, -1)
 
     def covers(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
         """(n,) whether each span from `start` to `end` (n,) seconds lies within the recording and outside its gaps."""
@@ -107,7 +124,17 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     """Readings of the rig's IMU, real or assumed; None if it has none."""
     if rig.imu is None or measurements.imu is None:
         return None
-    return ImuData.build(measurements.imu, rig.imu.noise, rig.assumes_motion and _is_dense(measurements))
+    imu = ImuData.build(measurements.imu, rig.imu.noise, rig.assumes_motion and _is_dense(measurements))
+    return replace(imu, unit=_unit(rig))
+
+
+def _unit(rig: Rig) -> Key | None:
+    """See `ImuData`: the scale of the sensor whose poses are those of the body."""
+    if not rig.assumes_motion:
+        return None
+    if rig.moves_by_poses:
+        return rig.poses[0].name, "scale"
+    return (BOARD, scene.SIZE.name) if rig.has_target else None
 
 
 def _is_dense(measurements: Measurements) -> bool:
@@ -132,4 +159,4 @@ def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> Im
     seams = tuple((float(seconds[i]), float(seconds[i + 1])) for i in last)
     gyro, accel = np.ascontiguousarray(joined.imu.gyro), np.ascontiguousarray(joined.imu.accel)
     first = imus[0][1]
-    return ImuData(joined.imu.name, seconds, gyro, accel, variance, first.walk, gaps, seams, first.forwards)
+    return ImuData(joined.imu.name, seconds, gyro, accel, variance, first.walk, gaps, seams, first.forwards, first.unit)

@@ -125,11 +125,12 @@ def test_the_steering_row_is_whitened_by_the_way_of_the_front_axle(drive_of_kind
     ("kind", "drive"), [("pair", [0.1, 0.12, 0.5]), ("twist", [1.1, 0.9, 0.0]), ("steered", [0.1, 0.6, 0.3])]
 )
 def test_derivatives_of_the_coefficients(kind, drive):
-    rng, drive = np.random.default_rng(0), np.array(drive)
+    """The last parameter is the unit of length."""
+    rng, drive = np.random.default_rng(0), np.array([*drive, 1.3])
     mean = rng.uniform(0.1, 0.9, (3, 3))
     made = coefficients(kind, drive, mean)
     assert np.abs(made.J_g_X).max() + np.abs(made.J_g_T).max() > 0.1
-    for k in range(2 if kind == "twist" else 3):
-        up, down = (coefficients(kind, drive + s * 1e-6 * np.eye(3)[k], mean) for s in (1.0, -1.0))
+    for k in (0, 1, 3) if kind == "twist" else range(4):
+        up, down = (coefficients(kind, drive + s * 1e-6 * np.eye(4)[k], mean) for s in (1.0, -1.0))
         np.testing.assert_allclose(made.J_g_X[:, :, k], (up.g_X - down.g_X) / 2e-6, rtol=1e-7, atol=1e-7)
         np.testing.assert_allclose(made.J_g_T[:, :, k], (up.g_T - down.g_T) / 2e-6, rtol=1e-7, atol=1e-7)

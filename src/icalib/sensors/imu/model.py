@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
 from icalib.data.measurements import ImuStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.rig import ImuNoise, ImuSensor, Settings
@@ -23,7 +25,8 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
         del stream, noise
         assert at.imu is not None
         columns = at.layout.columns(sensor.name, "intrinsics")
-        yield ImuFactor.build(at.imu, at.state, at.rig.gravity, columns[columns >= 0])
+        columns = np.concatenate([columns[columns >= 0], at.imu.unit_columns(at.layout)])
+        yield ImuFactor.build(at.imu, at.state, at.rig.gravity, columns)
 
 
 MODEL = ImuModel()

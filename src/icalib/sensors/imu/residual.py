@@ -26,6 +26,7 @@ from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
 from icalib.optim.state import KEYFRAME_DIM, State
 
 N_ROWS = 15  # of an interval
+IS_LENGTH = np.array([False] * 3 + [True] * 6 + [False] * 3 + [True] * 3)  # (15,) rows in m, m/s and m/s^2
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, N_ROWS)}
 
 
@@ -110,8 +111,8 @@ def _residual(k, chain, increments, change, R01, hv, hp, r):
 
 @njit(cache=True, nogil=True, inline="always")
 def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
-    """Fills J (15, 30 + 24 or 0) of r by keyframe k, keyframe k + 1 and intrinsics. The caller has set the constant
-    entries, zeros and the 1 and -1 of the biases."""
+    """Fills J (15, 30 + 24 or 0, and more) of r by keyframe k, keyframe k + 1 and intrinsics. The caller has set the
+    constant entries, zeros and the 1 and -1 of the biases."""
     Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
     J_first, J_v, J_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
     for i in range(3):
@@ -126,7 +127,7 @@ def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
             )
     J_change = mul3(Jr_inv, tmul3(so3.exp(r[:3]), so3.right_jacobian(change[:3])))
     for i in range(3):
-        for j in range(6 + J.shape[1] - KEYFRAME_PAIR_DIM):
+        for j in range(increments.J.shape[2]):
             J_rotation = 0.0
             for m in range(3):
                 J_rotation -= J_change[i, m] * increments.J[k, m, j]
@@ -136,13 +137,14 @@ def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
 
 
 @njit(cache=True, nogil=True)
-def _accumulate(k1, chain, increments, dx, columns, sums, out):
+def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
     """Adds intervals `sums.first` to k1 - 1 to the normal equations, and fills whitened residuals out (K - 1, 15).
 
-    dx, columns (24 or 0,): changes of the intrinsics since preintegration, and their calibration columns. Returns half
-    the chi^2. Without sums (empty arrays) only the residuals are filled.
+    dx (24 or 0,): changes of the intrinsics since preintegration. unit: see `ImuData`. columns: calibration columns of
+    the intrinsics, then of the unit if there is one. Returns half the chi^2. Without sums (empty arrays) only the
+    residuals are filled.
     """
-    width = KEYFRAME_PAIR_DIM + len(columns)
+    width, W = KEYFRAME_PAIR_DIM + len(columns), np.zeros((N_ROWS, N_ROWS))
     r, change, J, whitened = np.zeros(N_ROWS), np.zeros(9), np.zeros((N_ROWS, width)), np.empty((N_ROWS, width + 1))
     for i in range(9, N_ROWS):
         J[i, i], J[i, KEYFRAME_DIM + i] = -1.0, 1.0
@@ -155,12 +157,15 @@ def _accumulate(k1, chain, increments, dx, columns, sums, out):
         for i in range(N_ROWS):
             s = 0.0
             for m in range(i + 1):
-                s += increments.W[k, i, m] * r[m]
+                W[i, m] = increments.W[k, i, m] / unit if IS_LENGTH[m] else increments.W[k, i, m]
+                s += W[i, m] * r[m]
             out[k, i] = whitened[i, width] = s
             cost += 0.5 * s * s
         if with_sums:
             _jacobians(k, chain, increments, change, R01, hv, hp, r, J)
-            whiten(increments.W[k], J, whitened)
+            if len(columns) > len(dx):
+                J[:, width - 1] = np.where(IS_LENGTH, -r / unit, 0.0)
+            whiten(W, J, whitened)
             add_product(k - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost
 
@@ -176,12 +181,13 @@ class ImuFactor(RowFactor):
         R_k^T (p_k+1 - p_k - v_k dt - g dt^2 / 2) - dp - J_p db
         b_k+1 - b_k
 
-    starts: first keyframe of each recording; the intervals before them carry no information.
+    All but rotation and gyroscope bias are divided by the unit of length, see `ImuData`. starts: first keyframe of each
+    recording; the intervals before them carry no information.
     """
 
     imu: ImuData
     gravity: float  # [m/s^2]
-    columns: np.ndarray  # (24,) calibration columns of the intrinsics, or (0,) where they are fixed
+    columns: np.ndarray  # (24 or 0,) calibration columns of free intrinsics, and that of the unit of length if any
     increments: Increments
     intrinsics0: np.ndarray  # (24,) at which the intervals were preintegrated
     starts: tuple[int, ...] = (0,)
@@ -226,7 +232,7 @@ class ImuFactor(RowFactor):
     def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
         n = len(state.seconds) - 1
-        width = 6 + len(columns)
+        width = 6 + len(columns) - (imu.unit is not None)
         arrays = (
             np.empty((n, 3, 3)),
             np.empty((n, 3)),
@@ -258,6 +264,8 @@ class ImuFactor(RowFactor):
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
         del curved
-        dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0 if len(self.columns) else np.zeros(0)
+        dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0
+        dx = dx if self.increments.J.shape[2] > 6 else np.zeros(0)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        return _accumulate(piece.last, chain, self.increments, dx, self.columns, piece.sums(sums), out.residual)
+        unit = self.imu.unit_length(state)
+        return _accumulate(piece.last, chain, self.increments, dx, unit, self.columns, piece.sums(sums), out.residual)

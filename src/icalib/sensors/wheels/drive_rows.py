@@ -13,7 +13,9 @@ bicycle model: the front axle, a wheelbase L ahead, moves along its wheels, whic
 The model L e_3 T = tan(d) e_1 X is multiplied by cos(d), so that it also holds for steep angles and standstill. The
 noise of the angle then enters the derivative by L through cos(d) alone. cos and sin are means over the interval.
 
-All kinds have the rows e_2 X and e_3 X, the lateral and the vertical slip [m].
+All kinds have the rows e_2 X and e_3 X, the lateral and the vertical slip [m]. Their noise and that of steering are
+lengths that no sensor measures. The rows are divided by the unit of length of an assumed motion, see `ImuData`; else it
+is 1 m.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ import numpy as np
 
 from icalib.rig import WheelKind
 
-N_DRIVE = 3  # largest number of parameters of a kind
+N_DRIVE = 4  # largest number of parameters of a kind, and the unit of length
+UNIT = N_DRIVE - 1  # its index
 LEFT, RIGHT = -0.5, 0.5  # factor of baseline * e_3 T in the row of each wheel
 Kinds = dict[str, slice]
 SLIP: Kinds = {"lateral slip": slice(2, 3), "vertical slip": slice(3, 4)}
@@ -42,8 +45,8 @@ UNITS = {
 class Coefficients(NamedTuple):
     """Coefficients of the four rows in wheel axes, for each of k = n intervals, or for all of them (k = 1).
 
-    g_X, g_T (k, 4, 3); J_g_X, J_g_T (k, 4, 3, 3): their derivatives by the drive parameters, indexed by interval, row,
-    parameter and axis.
+    g_X, g_T (k, 4, 3); J_g_X, J_g_T (k, 4, N_DRIVE, 3): their derivatives by the drive parameters, indexed by interval,
+    row, parameter and axis.
     """
 
     g_X: np.ndarray
@@ -53,19 +56,20 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(kind: WheelKind, drive: np.ndarray, mean: np.ndarray) -> Coefficients:
-    """The coefficients at the drive parameters `drive` (3,), padded with zeros.
+    """The coefficients at the drive parameters `drive` (N_DRIVE,), padded with zeros, the last the unit of length.
 
     mean (n, m - 1): means over each interval of the signals whose integrals are columns 1: of `integrals_of`.
     """
-    c = _slip_rows(len(mean) if kind == "steered" else 1)
+    k = len(mean) if kind == "steered" else 1
+    g, J_g = (k, 4, 3), (k, 4, N_DRIVE, 3)
+    c = Coefficients(np.zeros(g), np.zeros(g), np.zeros(J_g), np.zeros(J_g))
     {"pair": _pair, "twist": _twist, "steered": _steered}[kind](c, drive, mean)
-    return c
-
-
-def _slip_rows(k: int) -> Coefficients:
-    """Coefficients of k intervals with the two slip rows filled and zeros elsewhere."""
-    c = Coefficients(np.zeros((k, 4, 3)), np.zeros((k, 4, 3)), np.zeros((k, 4, 3, 3)), np.zeros((k, 4, 3, 3)))
     c.g_X[:, 2, 1] = c.g_X[:, 3, 2] = 1.0
+    for row in (1, 2, 3) if kind == "steered" else (2, 3):
+        for x, J in ((c.g_X[:, row], c.J_g_X[:, row]), (c.g_T[:, row], c.J_g_T[:, row])):
+            x /= drive[UNIT]
+            J /= drive[UNIT]
+            J[:, UNIT] = -x / drive[UNIT]
     return c
 
 
@@ -90,7 +94,7 @@ def _twist(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
 
 def _steered(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
     """Fills the first two rows of a steered vehicle; mean (n, 2 or more): mean cos and sin of the steering angle."""
-    r, base, offset = drive
+    r, base, offset = drive[:UNIT]
     c.g_X[:, 0, 0], c.J_g_X[:, 0, 0, 0] = 1.0 / r, -1.0 / r**2
     cosine = mean[:, 0] * np.cos(offset) - mean[:, 1] * np.sin(offset)
     sine = mean[:, 1] * np.cos(offset) + mean[:, 0] * np.sin(offset)

@@ -26,8 +26,8 @@ from icalib.sensors.wheels.drive_rows import N_DRIVE
 
 
 class WheelParameters(NamedTuple):
-    """Extrinsics R = R_imu_wheel (3, 3), p = p_imu_wheel (3,) [m], and drive parameters drive (3,), see `drive_rows`;
-    for a pair left radius, right radius and baseline [m]."""
+    """Extrinsics R = R_imu_wheel (3, 3), p = p_imu_wheel (3,) [m], and drive (N_DRIVE,), see `coefficients`; for a
+    pair left radius, right radius, baseline and unit of length [m]."""
 
     R: np.ndarray
     p: np.ndarray
@@ -121,9 +121,9 @@ def _to_imu_axes(wheels, gX, gT):
 
 @njit(cache=True, nogil=True)
 def _fill_drive(i, q, J_gX, J_gT, X, T, rows):
-    """Fills the derivatives of row q of interval i by the drive parameters; J_gX, J_gT (3, 3): derivatives of the row's
-    coefficients, by parameter and axis."""
-    for d in range(3):
+    """Fills the derivatives of row q of interval i by the drive parameters; J_gX, J_gT (N_DRIVE, 3): derivatives of the
+    row's coefficients, by parameter and axis."""
+    for d in range(N_DRIVE):
         s = 0.0
         for k in range(3):
             s += J_gX[d, k] * X[k] + J_gT[d, k] * T[k]

@@ -41,7 +41,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
-from icalib.sensors.wheels.drive_rows import KINDS, N_DRIVE, UNITS, Kinds, coefficients
+from icalib.sensors.wheels.drive_rows import KINDS, N_DRIVE, UNIT, UNITS, Kinds, coefficients
 from icalib.sensors.wheels.increment_kernels import MotionSamples, WheelParameters, increment_rows
 from icalib.sensors.wheels.planar_poses import RelativePoses, preintegrated
 from icalib.sensors.wheels.propagation_noise import propagation_noise
@@ -120,7 +120,8 @@ class WheelFactor(RowFactor, ABC):
         calibration columns of the rows are those of the pose, then those of the drive parameters."""
         cost, keyframe = 0.0, self.intervals.keyframe[block]
         drive = self.layout.columns(self.name, *drive_names(self.kind))
-        drive = np.concatenate([drive, np.full(N_DRIVE - len(drive), -1)])
+        unit = self.imu.unit_columns(self.layout)
+        drive = np.concatenate([drive, np.full(N_DRIVE - len(drive) - len(unit), -1), unit])
         kinematics = Kinematics.of(self)
         for clock, part in slices_by_clock(state, self.name, keyframe):
             columns = np.concatenate([kinematics.columns(clock), drive])
@@ -212,7 +213,10 @@ class IncrementFactor(WheelFactor):
         times = self.instants.times[used] + offset_at(state, self.name, keyframe)
         poses, velocities = _motion(self, times, keyframe, state, into.sums)
         rows = Rows.empty(len(start) - 1, 4, N_POSE_PARAMETERS + poses.J_imu.shape[2] + N_DRIVE, into.sums)
-        wheels = _wheel_parameters(self.name, state, self.kind)
+        drive = np.append(drive_of(self.name, state, self.kind), self.imu.unit_length(state))
+        wheels = WheelParameters(
+            np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"], drive
+        )
         c = coefficients(self.kind, wheels.drive, self.mean[block])
         increment_rows(
             start - start[0], self.instants.weight[used], _samples(keyframe, poses), velocities, wheels, c,
@@ -311,7 +315,9 @@ class RelativePoseFactor(WheelFactor):
         )
         residual = relative.residual[:, YAW_X_Y] - z.z[block] - z.J_drive[block] @ (drive - z.drive0)
         J_pose = [np.ascontiguousarray(J[:, YAW_X_Y]) for J in relative.J_pose]
-        rows = rows_at(residual, J_pose, (first, last), -z.J_drive[block] if into.sums else z.J_drive[:0])
+        J_drive = -z.J_drive[block] if into.sums else z.J_drive[:0]
+        J_drive = np.pad(J_drive, ((0, 0), (0, 0), (0, 1)))  # recorded poses are in metres, not in the unit of length
+        rows = rows_at(residual, J_pose, (first, last), J_drive)
         return self._add(block, rows, state, into)
 
 
@@ -330,7 +336,7 @@ def drive_of(name: str, state: State, kind: WheelKind = "pair") -> np.ndarray:
     """Drive parameters (3,) of the wheels `name` in the order of `rig.DRIVES`, padded with zeros; for a pair left
     radius, right radius, baseline [m]."""
     drive = np.concatenate([state.values[name, group] for group in drive_names(kind)])
-    return np.concatenate([drive, np.zeros(N_DRIVE - len(drive))])
+    return np.concatenate([drive, np.zeros(UNIT - len(drive))])
 
 
 def _row_sigma(
@@ -348,11 +354,6 @@ def _row_sigma(
     if kind == "steered":
         sigma[:, 1] = np.hypot(sigma[:, 1], noise.steering * drive[0] * np.sqrt(integrals[:, 3]))
     return sigma
-
-
-def _wheel_parameters(name: str, state: State, kind: WheelKind) -> WheelParameters:
-    rotation = np.ascontiguousarray(state.values[name, "rotation"])
-    return WheelParameters(rotation, state.values[name, "translation"], drive_of(name, state, kind))
 
 
 def _motion(
