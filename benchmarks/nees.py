@@ -1,9 +1,13 @@
 """Are standard deviations as large as errors? NEES of many short simulated recordings, by kind of sensor.
 
-python benchmarks/nees.py [--first-seed N] [--rounds N]
+python benchmarks/nees.py [--first-seed N] [--rounds N] [--without-imu MINUTES]
 
 A round is what tests/consistency/test_sigmas.py runs, with other seeds. The mean normalised estimation error squared
 (NEES) per degree of freedom is printed, and the bounds within which it is where standard deviations are honest.
+
+With --without-imu, wheels beside motion capture and wheels beside a camera are calibrated for that long instead, five
+seeds each. True scales are drawn from their priors. Nothing else shows a length, so that each estimated scale is 1. The
+NEES is that of the wheels' radii and baseline.
 """
 
 from __future__ import annotations
@@ -15,8 +19,9 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Rig
+from icalib.rig import PoseSensor, Rig
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
@@ -26,6 +31,8 @@ from icalib.tools.montecarlo.statistics import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
+WALL_GRID = AprilGrid(4, 10, 0.6, 0.3)
+ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
 FALSE_ALARMS = 1e-3  # in a round, where standard deviations are honest
 TOGETHER = "all"
 LEAST_DOF = 400  # for sigmas 1.3 times too small or too large to be beyond chance
@@ -160,11 +167,63 @@ def _judged(kind: str, runs: list[tuple[RunRecord, np.ndarray]]) -> Judged:
     return Judged(kind, dof, nees(by_covariance, probability), nees(by_printed, probability))
 
 
+def scenarios_without_imu(seconds: float) -> dict[str, Scenario]:
+    """A vehicle on ramps, its wheels beside motion capture or beside a camera that sees a wall of tags."""
+    scenario = load_scenario(PAPER / "table2-ramp.yaml")
+    wheels = tuple(replace(w, noise=0.005, allowed_slip=1e-4) for w in scenario.of(SimWheels))
+    scenario = replace(scenario, duration_s=seconds, features=None, imu_noise_enabled=False)
+    camera = replace(scenario.cameras[0], corner_noise_px=0.15)
+    wall = {"board": True, "T_world_board": ON_WALL, "target": WALL_GRID}
+    return {
+        "mocap": replace(scenario, cameras=(), sensors=(*wheels, _mocap())),
+        "camera": replace(scenario, cameras=(camera,), sensors=wheels, **wall),
+    }
+
+
+def lengths(scenario: Scenario, seed: int) -> tuple[float, float, Sample, str]:
+    """Estimated scale and its standard deviation, errors of the wheels' sizes, and the verdict, without an IMU."""
+    scale = np.random.default_rng(seed).normal()
+    if scenario.board:
+        scenario = replace(scenario, target_size=1.0 + scenario.target.size_sigma * scale)
+    else:
+        poses = (replace(p, scale=1.0 + PoseSensor.scale_sigma * scale) for p in scenario.of(SimPoses))
+        scenario = scenario.with_sensors(*poses)
+    simulation = simulate(scenario, seed)
+    rig = rig_for(scenario).with_(imu=None)
+    rig = rig.with_(poses=tuple(replace(p, scale_sigma=PoseSensor.scale_sigma) for p in rig.poses))
+    rig = rig.with_(target=replace(rig.target, size_sigma=scenario.target.size_sigma))
+    result = calibrate_measurements(rig, simulation.measurements.without("imu0"))
+    groups = [result.group("wheel0", name) for name in ("radii", "baseline")]
+    columns = np.concatenate([g.columns for g in groups if g.columns is not None])
+    error = np.concatenate([g.value - simulation.truth.values["wheel0"][g.name] for g in groups])
+    (own,) = (g for g in result.groups if g.name in ("scale", "size"))
+    sample = Sample(seed, error, result.covariance[np.ix_(columns, columns)])
+    return float(own.value[0]), float(own.std[0]), sample, result.verdict
+
+
+def check_without_imu(minutes: float, seeds: range) -> int:
+    """Prints each run and the NEES. Returns the number of checks that failed."""
+    failed = 0
+    for name, scenario in scenarios_without_imu(60.0 * minutes).items():
+        runs = [lengths(scenario, seed) for seed in seeds]
+        for scale, std, sample, verdict in runs:
+            print(f"{name:8s} seed {sample.seed}: scale {scale:.6f} +- {std:.6f}, {verdict}", flush=True)
+            failed += verdict == "not usable"
+        together = nees([sample for _, _, sample, _ in runs], 1.0 - FALSE_ALARMS)
+        mean = float(np.mean([(scale - 1.0) / std for scale, std, _, _ in runs]))
+        print(f"{name:8s} scale {mean:+.2f} sigma, NEES {together.mean:.2f}, {together.low:.2f} to {together.high:.2f}")
+        failed += abs(mean) > 0.5 or not together.consistent
+    return failed
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument("--without-imu", type=float, metavar="MINUTES")
     options = parser.parse_args()
+    if options.without_imu is not None:
+        return min(check_without_imu(options.without_imu, range(options.first_seed, options.first_seed + 5)), 1)
     failed = 0
     for round_ in range(options.rounds):
         for name, make in CASES.items():

@@ -236,3 +236,22 @@ def test_poses_of_half_a_degree_and_a_centimetre(robot, first):
     poses = (mocap(), poor) if first == "mocap0" else (poor, mocap())
     rig, measurements, simulation = without_imu(robot("3d", 20.0, "").with_sensors(*poses))
     check_known(calibrate_measurements(rig, measurements), simulation, 7)
+
+
+@pytest.mark.parametrize(("parts", "seconds"), [("w", 20.0), ("cw", 20.0), ("w", 300.0)])
+def test_a_scale_that_no_measurement_shows_is_its_prior(robot, parts, seconds):
+    """With an assumed motion or slip in metres, the last one ends at 0.9949, five standard deviations, and is not
+    usable."""
+    scenario = robot("ramp", seconds, parts)
+    rig, measurements, simulation = without_imu(scenario.with_sensors(mocap()) if parts == "w" else scenario, 1)
+    rig = rig.with_(
+        target=replace(rig.target, size_sigma=2e-3), poses=tuple(replace(p, scale_sigma=1e-3) for p in rig.poses)
+    )
+    result = calibrate_measurements(steady(rig), measurements)
+    assert result.converged and result.verdict != "not usable", result.reasons
+    (scale,) = (g for g in result.groups if g.name in ("scale", "size"))
+    assert scale.value[0] == pytest.approx(1.0, abs=0.05 * scale.std_formal[0])
+    sizes = [result.group("wheel0", name) for name in ("radii", "baseline")]
+    columns = np.concatenate([not_none(g.columns) for g in sizes])
+    errors = np.concatenate([g.value - simulation.truth.values["wheel0"][g.name] for g in sizes])
+    assert errors @ np.linalg.solve(result.covariance[np.ix_(columns, columns)], errors) < chi2.ppf(0.999, 3)
