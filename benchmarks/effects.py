@@ -87,7 +87,7 @@ def lidar_imu() -> Scenario:
 
 def poses_imu() -> Scenario:
     """Motion capture of a body that moves freely, 10 s."""
-    room, motion = Room((8.0, 6.0, 3.0)), Drive("free", exact=True)
+    room, motion = Room((8.0, 6.0, 3.0)), Drive("free")
     return Scenario((), duration_s=10.0, motion=motion, board=False, room=room, sensors=(_mocap(),))
 
 

@@ -22,8 +22,8 @@ ImuQuality = Literal["datasheet", "noisy"]
 
 
 def moving(kind: str, imu: ImuQuality = "datasheet") -> Scenario:
-    scenario = handheld(20.0, imu=imu, exact=False)
-    return dataclasses.replace(scenario, motion=dataclasses.replace(scenario.motion, kind=kind, exact=False))
+    scenario = handheld(20.0, imu=imu)
+    return dataclasses.replace(scenario, motion=dataclasses.replace(scenario.motion, kind=kind))
 
 
 def guessed(simulation: Simulation, seed: int, mode: str) -> Rig:

@@ -43,8 +43,8 @@ def sensor(kind, name="mocap0", **others):
     )
 
 
-def alone(kind, motion: DriveKind = "free", exact=True, **others):
-    drive = Drive(motion, exact=exact)
+def alone(kind, motion: DriveKind = "free", **others):
+    drive = Drive(motion)
     return Scenario((), duration_s=12.0, motion=drive, board=False, room=ROOM, sensors=(sensor(kind),), **others)
 
 
@@ -123,7 +123,7 @@ def test_poses_that_alternate_or_drift_are_named():
 
 def test_planar_motion_leaves_height_open():
     """About one axis the lever arm along it and the frame's height are one; the rest is right."""
-    scenario = alone("absolute", "planar", exact=False)
+    scenario = alone("absolute", "planar")
     sim = simulate(replace(scenario, duration_s=20.0), 4)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
     assert result.unobservable

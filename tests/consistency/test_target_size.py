@@ -55,7 +55,7 @@ def test_of_tags_in_a_room_all_sizes_and_distances_grow_together():
 
 def test_a_length_that_is_known_shows_the_size_too():
     """A baseline that the rig file fixes: better than any accelerometer."""
-    made = handheld(SECONDS, exact=False)
+    made = handheld(SECONDS)
     simulation, rig = simulate(made, 0), of_size(rig_for(made), 0.95)
     cameras = tuple(
         replace(c, translation=replace(c.translation, mode="fixed", value=simulation.truth.T_imu_sensor[c.name][:3, 3]))
@@ -65,12 +65,12 @@ def test_a_length_that_is_known_shows_the_size_too():
     estimate = determine(inputs, state, guess=guess).estimate
     size = target_size(estimate.problem, estimate.outcome.state)
     assert size is not None
-    assert size.std < 0.75 * found(0, 0.95, exact=False).std
+    assert size.std < 0.75 * found(0, 0.95).std
     assert abs(size.ratio - 1.0 / 0.95) < 4.0 * size.std
 
 
 def excess(seeds: range, said: float) -> list[float]:
-    sizes = [found(seed, said, exact=False) for seed in seeds]
+    sizes = [found(seed, said) for seed in seeds]
     return [(s.ratio - 1.0 / said) / s.std for s in sizes]
 
 
@@ -89,7 +89,7 @@ def test_over_many_recordings_it_is_off_by_what_is_said(said):
 
 def sentences(said: float, **changes) -> tuple[str, str]:
     """Warnings and notes on the size."""
-    scenario = replace(handheld(SECONDS, exact=False), **changes)
+    scenario = replace(handheld(SECONDS), **changes)
     result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
     return tuple(" ".join(s for s in of if "the target is" in s) for of in (result.warnings, result.notes))  # type: ignore[return-value]
 
@@ -104,7 +104,7 @@ def test_a_print_that_was_fitted_to_the_page_is_a_warning():
 @pytest.mark.parametrize(("said", "certain"), [(0.97, False), (0.9, True)])
 def test_what_no_accelerometer_could_be_is_wrong(said, certain):
     """Accelerometers are off by 3 % at most."""
-    scenario = handheld(SECONDS, exact=False)
+    scenario = handheld(SECONDS)
     result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
     assert "by the accelerometer the target is" in result.warnings[0]
     assert result.wrong == (result.warnings[:1] if certain else ())
@@ -117,8 +117,8 @@ def test_the_right_size_is_a_note():
 
 
 def test_a_recording_that_does_not_show_it_says_nothing():
-    scenario = handheld(SECONDS, exact=False)
-    still = replace(scenario, motion=replace(scenario.motion, kind="motionless", exact=False))
+    scenario = handheld(SECONDS)
+    still = replace(scenario, motion=replace(scenario.motion, kind="motionless"))
     rig, simulation = rig_for(still), simulate(still, 0)
     cameras = []
     for c in rig.cameras:

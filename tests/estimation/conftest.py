@@ -351,7 +351,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
 
 
 def room_scenario(
-    duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, exact: bool = True, **lidar
+    duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, **lidar
 ) -> Scenario:
     """The paper's robot with IMU and LiDAR alone, moving freely or as another example; `lidar`: changes of it."""
     scenario = load_scenario(PAPER / f"{example}.yaml")
@@ -362,7 +362,6 @@ def room_scenario(
         sensors=(replace(scenario.of(SimLidar)[0], **lidar),),
         features=None,
         board=False,
-        motion=replace(scenario.motion, exact=exact),
         imu_noise_enabled=not noiseless,
         robot_noise_enabled=not noiseless,
     )

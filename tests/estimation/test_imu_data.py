@@ -42,9 +42,9 @@ def test_drawn_noise_turns_as_far(imu):
 def test_in_a_gap_it_is_the_unseen_motion_that_turns():
     stamps = np.arange(0, 10**9, 5 * 10**6)
     moving = stream(stamps[(stamps < 4 * 10**8) | (stamps > 5 * 10**8)])
-    moving = replace(moving, gyro=np.random.default_rng(1).normal(size=moving.gyro.shape))
+    moving = replace(moving, gyro=np.sin(9.0 * moving.seconds)[:, None] * np.ones(3))
     imu = ImuData.build(moving, NOISE)
     assert np.diff(imu.seconds).max() > MIN_GAP_PERIODS * 5e-3
     across, beside = imu.rotation_sigma(np.array([0.39, 0.29]), np.array([0.45, 0.35]))
-    assert beside == pytest.approx(DENSITY * np.sqrt(0.06), rel=1e-9)
+    assert beside == pytest.approx(DENSITY * np.sqrt(0.06), rel=1e-3)
     assert across > 30.0 * beside

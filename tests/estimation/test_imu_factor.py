@@ -37,9 +37,9 @@ def whitened(factor, setup, state):
 
 
 def test_no_residual_at_the_truth(factor, setup):
-    """Unwhitened, in rad, m/s, m."""
+    """Unwhitened, in rad, m/s, m: the interpolation between readings leaves 1 % of their noise at most."""
     _, out = whitened(factor, setup, setup.state)
-    np.testing.assert_allclose(np.linalg.solve(factor.increments.W, out[..., None]), 0.0, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.solve(factor.increments.W, out[..., None]), 0.0, atol=3e-7)
 
 
 def test_residual_is_the_formula(factor, setup):
@@ -75,7 +75,7 @@ def test_residuals_are_whitened_with_the_covariance_of_the_increments(factor, se
             integration_workspace(COVARIANCE_SIZE),
             tuple(setup.state.bias[k]),
         )
-        integrate(t[k], t[k + 1], first, bias, readings_of(imu, False), by, room, out)
+        integrate(t[k], t[k + 1], first, bias, readings_of(imu), by, room, out)
         np.testing.assert_allclose(factor.increments.W[k] @ P @ factor.increments.W[k].T, np.eye(15), rtol=0, atol=1e-9)
         assert (np.triu(factor.increments.W[k], 1) == 0).all()
         np.testing.assert_allclose(factor.increments.J[k, :, :6], J, rtol=0, atol=1e-15)

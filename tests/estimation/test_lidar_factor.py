@@ -140,7 +140,7 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
 
 def brisk(robot):
     """One point in each millisecond, anywhere in it; 2 rad/s and 8 m/s^2 at times."""
-    scenario = robot(4.0, noiseless=True, exact=False)
+    scenario = robot(4.0, noiseless=True)
     simulation = simulate(scenario, seed=0)
     stream = simulation.measurements.lidars[0]
     rng = np.random.default_rng(1)

@@ -40,7 +40,7 @@ def world(request):
         clock_origin_ns=777,
         scale=1.02,
     )
-    drive = Drive("free", exact=True)
+    drive = Drive("free")
     scenario = Scenario(
         (),
         duration_s=4.0,

@@ -145,10 +145,9 @@ def test_acceleration_is_the_time_derivative_of_the_velocity(setup):
     np.testing.assert_allclose(moving.acceleration, (plus.velocity - minus.velocity) / (2 * h), rtol=0, atol=2e-3)
 
 
-# `inertial` integrates the mean of the readings over a part of an interval, while its rate and velocity are
-# those at the end: what the two differ by goes with the part squared (readings 5 ms apart).
+# Rate and velocity of `inertial` are those at the end, without the third-order terms of the step (readings 5 ms apart).
 @pytest.mark.parametrize(
-    ("scheme", "rate", "velocity"), [("inertial", 5e-5, 5e-4), ("kinematic", 1e-8, 1e-8), ("pose", 1e-8, 1e-8)]
+    ("scheme", "rate", "velocity"), [("inertial", 2e-6, 2e-5), ("kinematic", 1e-8, 1e-8), ("pose", 1e-8, 1e-8)]
 )
 def test_rate_and_velocity_are_the_time_derivative(setup, scheme, rate, velocity):
     state, h = setup.perturbed(np.random.default_rng(3)), 1e-6
@@ -175,25 +174,33 @@ def test_shapes_without_what_is_not_wanted(setup):
     assert inertial.J_next.shape == (0, 6, KEYFRAME_DIM)
 
 
-def test_inertial_is_exact_from_stamp_to_stamp_on_an_exact_trajectory(setup):
+def parabola(imu, t):
+    """Readings (n, 6) at t (n,): between stamps those of the parabola through both and of the signal's mean."""
+    values, means = imu.signals
+    j = imu.interval(t)
+    u = ((t - imu.seconds[j]) / (imu.seconds[j + 1] - imu.seconds[j]))[:, None]
+    bend = 6.0 * means[j] - 3.0 * (values[j] + values[j + 1])
+    return values[j] + u * (values[j + 1] - values[j]) + bend * u * (1.0 - u)
+
+
+def test_inertial_follows_the_true_trajectory(setup):
     keyframes = np.array([0.05, 0.2])
     R, p, v = setup.truth_at(keyframes)
     state = replace(setup.state, seconds=keyframes, rotation=R, position=p, velocity=v, bias=setup.state.bias[:2])
     times = setup.imu.seconds[setup.imu.seconds < 0.3]
     at = poses_at("inertial", times, assign_keyframes("inertial", keyframes, times), state, setup.imu, 9.81, False)
     R, p, v = setup.truth_at(times)
-    np.testing.assert_allclose(at.rotation, R, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(at.position, p, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(at.velocity, v, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(at.rotation, R, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(at.position, p, rtol=0, atol=3e-8)
+    np.testing.assert_allclose(at.velocity, v, rtol=0, atol=1e-6)
 
 
-def test_inertial_follows_readings_that_go_linearly_from_stamp_to_stamp(setup):
+def test_inertial_follows_readings_between_stamps(setup):
     """3.7 ms into an interval, against 200 small steps of the interpolated readings."""
     state, imu, dt = setup.state, setup.imu, 3.7e-3 / 200
     R, p, v = state.rotation[3], state.position[3], state.velocity[3]
-    readings = np.hstack([imu.gyro, imu.accel])
     for i in range(200):
-        raw = np.array([np.interp(0.2 + (i + 0.5) * dt, imu.seconds, x) for x in readings.T]) - state.bias[3]
+        raw = parabola(imu, np.array([0.2 + (i + 0.5) * dt]))[0] - state.bias[3]
         intrinsics = state.values["imu0", "intrinsics"]
         rate, force = corrected_rate(intrinsics, raw[None])[0], corrected_force(intrinsics, raw[None])[0]
         force = R @ Rotation.from_rotvec(0.5 * dt * rate).apply(force) + [0.0, 0.0, -9.81]
@@ -220,12 +227,7 @@ def test_kinematic_keeps_the_rate_and_velocity_of_the_keyframe(setup):
     at, keyframe = evaluate(setup, "kinematic")
     state = setup.state
     dt = TIMES - state.seconds[keyframe]
-    raw = np.array(
-        [
-            np.interp(state.seconds[keyframe], setup.imu.seconds, x)
-            for x in np.hstack([setup.imu.gyro, setup.imu.accel]).T
-        ]
-    ).T
+    raw = parabola(setup.imu, state.seconds[keyframe])
     rate = corrected_rate(state.values["imu0", "intrinsics"], raw - state.bias[keyframe])
     np.testing.assert_allclose(at.rate, rate, rtol=0, atol=1e-13)
     np.testing.assert_allclose(at.velocity, state.velocity[keyframe], rtol=0, atol=0)

@@ -27,7 +27,7 @@ def angle_deg(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def simulation() -> Simulation:
-    return simulate(handheld(20.0, asynchronous=True, exact=False), 3)
+    return simulate(handheld(20.0, asynchronous=True), 3)
 
 
 def shifted(measurements: Measurements, seconds: float) -> Measurements:
@@ -276,7 +276,7 @@ def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
 
 def test_one_axis_of_rotation_is_not_enough_and_said():
     simulation = simulate(
-        dataclasses.replace(handheld(15.0, exact=False), motion=HandheldMotion("single_axis", exact=False)), 0
+        dataclasses.replace(handheld(15.0), motion=HandheldMotion("single_axis")), 0
     )
     assert "one axis" in failure(rig_for(simulation.scenario), simulation.measurements)
     initial_guess(rig_for(simulation.scenario, rotation="fixed"), simulation.measurements)

@@ -34,7 +34,7 @@ def with_target(duration_s=12.0, **fields):
 
 def in_a_room(*sensors, duration_s=20.0, **fields):
     room = Room((30.0, 20.0, 6.0))
-    motion = Drive("free", exact=True)
+    motion = Drive("free")
     return Scenario((), duration_s=duration_s, motion=motion, board=False, room=room, sensors=sensors, **fields)
 
 

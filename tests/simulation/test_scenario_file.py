@@ -23,7 +23,7 @@ FULL = f"""\
 duration: 3
 seed: 7
 start_ns: 5000000000
-motion: {{kind: planar, exact: true, sideslip_deg: 0.5, seed: 4}}
+motion: {{kind: planar, sideslip_deg: 0.5, seed: 4}}
 sensors:
   imu0:
     type: imu
@@ -100,7 +100,7 @@ def loaded(tmp_path, text):
 def test_every_field_arrives(tmp_path):
     s = loaded(tmp_path, FULL)
     assert (s.duration_s, s.seed, s.imu_clock_origin_ns, s.imu_rate_hz) == (3.0, 7, 5_000_000_000, 200.0)
-    assert s.motion == Drive("planar", exact=True, sideslip_deg=0.5, seed=4)
+    assert s.motion == Drive("planar", sideslip_deg=0.5, seed=4)
     n = s.imu_noise
     assert (n.gyro, n.gyro_walk, n.accel, n.accel_walk) == (1e-4, 2e-5, 3e-3, 4e-4)
     assert s.gyro_bias == (0.01, 0.02, 0.03) and s.accel_bias == (0.1, 0.2, 0.3)

@@ -1,6 +1,17 @@
 """Integration of IMU readings between two instants, forwards or backwards, with Jacobians and covariance.
 
-Between two IMU stamps body rate and specific force are constant, the mean of the two readings; see `integration_step`.
+Readings sample band-limited signals. Between two stamps each is the parabola through both readings whose mean is that of
+the signal (`ImuData.signals`). A step takes this mean over its part of the interval as constant, and adds the second-order
+terms of the variation: coning, sculling and scrolling (Savage, Strapdown inertial navigation integration algorithm
+design, JGCD 1998). With the changes d of the rate and e of the force over a step of dt,
+
+    w <- w + dt (w x d) / 12
+    f <- f + dt (w x e + f x d) / 12
+    p <- p - dt^2 (e + dt (w x e) / 2) / 12
+
+The vectors in these terms are readings as recorded. Biases and intrinsics would change them by less than noise does, and
+Jacobians stay exact.
+
 Increments are relative to the start: R_0^T R_1; R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g T^2/2). Errors
 are rotation (on the right), velocity, position, gyroscope bias, accelerometer bias, in this order.
 """
@@ -23,6 +34,7 @@ from icalib.motion.integration_step import (
     ROW_H,
     RUN_SIZE,
     add_covariance,
+    cross,
     matrix,
     start,
     step,
@@ -31,18 +43,14 @@ from icalib.motion.integration_step import (
 
 
 class Readings(NamedTuple):
-    """t (N,) seconds on the IMU clock; gyro, accel (N, 3); variance (N, 3), walk (2,): see `ImuData`.
-
-    linear: readings are interpolated linearly between stamps, and a part of an interval uses their mean over that part.
-    Whole intervals are unchanged. The pose at the end then has a continuous time derivative.
-    """
+    """t (N,) seconds on the IMU clock; values (N, 6): rates [rad/s] and specific forces [m/s^2] at the stamps; means (N -
+    1, 6): of each interval; variance (N - 1, 3), walk (2,): see `ImuData`."""
 
     t: np.ndarray
-    gyro: np.ndarray
-    accel: np.ndarray
+    values: np.ndarray
+    means: np.ndarray
     variance: np.ndarray
     walk: np.ndarray
-    linear: bool
 
 
 class Increment(NamedTuple):
@@ -57,26 +65,58 @@ class Increment(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def corrected(gyro, accel, j, share, bias, by):
-    """Body rate and specific force (3,), from readings interpolated at `share` of the interval from stamp j to j +
-    1."""
-    w = (
-        gyro[j, 0] + share * (gyro[j + 1, 0] - gyro[j, 0]) - bias[0],
-        gyro[j, 1] + share * (gyro[j + 1, 1] - gyro[j, 1]) - bias[1],
-        gyro[j, 2] + share * (gyro[j + 1, 2] - gyro[j, 2]) - bias[2],
+def _part(readings, j, c, a, b):
+    """Mean and change of signal c (0 to 5) from a to b in interval j; a, b: -1/2 at its first stamp, 1/2 at its last."""
+    x0, x1, mean = readings.values[j, c], readings.values[j + 1, c], readings.means[j, c]
+    slope, bend = x1 - x0, 3.0 * (x0 + x1) - 6.0 * mean
+    return (
+        mean + 0.5 * slope * (a + b) + bend * ((a * a + a * b + b * b) / 3.0 - 1.0 / 12.0),
+        (b - a) * (slope + bend * (a + b)),
     )
-    f = (
-        accel[j, 0] + share * (accel[j + 1, 0] - accel[j, 0]) - bias[3],
-        accel[j, 1] + share * (accel[j + 1, 1] - accel[j, 1]) - bias[4],
-        accel[j, 2] + share * (accel[j + 1, 2] - accel[j, 2]) - bias[5],
+
+
+@njit(cache=True, nogil=True)
+def _part_of_signals(readings, j, a, b):
+    """`_part` of rate and specific force: their means, then their changes, (3,) each."""
+    w0, d0 = _part(readings, j, 0, a, b)
+    w1, d1 = _part(readings, j, 1, a, b)
+    w2, d2 = _part(readings, j, 2, a, b)
+    f0, e0 = _part(readings, j, 3, a, b)
+    f1, e1 = _part(readings, j, 4, a, b)
+    f2, e2 = _part(readings, j, 5, a, b)
+    return (w0, w1, w2), (f0, f1, f2), (d0, d1, d2), (e0, e1, e2)
+
+
+@njit(cache=True, nogil=True)
+def _corrected(w, f, bias, by):
+    """Body rate and specific force (3,) from readings w, f, without biases and errors of the intrinsics."""
+    w = w[0] - bias[0], w[1] - bias[1], w[2] - bias[2]
+    f = f[0] - bias[3], f[1] - bias[4], f[2] - bias[5]
+    x, y = times(matrix(by, ROW_G), w), times(matrix(by, ROW_H), f)
+    return (x[0] + y[0], x[1] + y[1], x[2] + y[2]), times(matrix(by, ROW_F), f)
+
+
+@njit(cache=True, nogil=True)
+def corrected(readings, j, at, bias, by):
+    """Body rate and specific force (3,) at `at` of interval j: -1/2 at its first stamp, 1/2 at its last."""
+    w, f, _, _ = _part_of_signals(readings, j, at, at)
+    return _corrected(w, f, bias, by)
+
+
+@njit(cache=True, nogil=True)
+def _effective(readings, j, a, b, dt, bias, by):
+    """Corrected rate and force (3,) that, constant over the step of dt [s] from a to b (as in `_part`), give its
+    rotation and velocity; and its displacement (3,) [m] beyond theirs."""
+    w, f, d, e = _part_of_signals(readings, j, a, b)
+    wd, we, fd, c = cross(w, d), cross(w, e), cross(f, d), dt / 12.0
+    rate, force = _corrected(
+        (w[0] + c * wd[0], w[1] + c * wd[1], w[2] + c * wd[2]),
+        (f[0] + c * (we[0] + fd[0]), f[1] + c * (we[1] + fd[1]), f[2] + c * (we[2] + fd[2])),
+        bias,
+        by,
     )
-    A, B = matrix(by, ROW_G), matrix(by, ROW_H)
-    rate = (
-        A[0] * w[0] + B[0] * f[0] + (A[1] * w[1] + B[1] * f[1]) + (A[2] * w[2] + B[2] * f[2]),
-        A[3] * w[0] + B[3] * f[0] + (A[4] * w[1] + B[4] * f[1]) + (A[5] * w[2] + B[5] * f[2]),
-        A[6] * w[0] + B[6] * f[0] + (A[7] * w[1] + B[7] * f[1]) + (A[8] * w[2] + B[8] * f[2]),
-    )
-    return rate, times(matrix(by, ROW_F), f)
+    b, h = -c * dt, 0.5 * dt
+    return rate, force, (b * (e[0] + h * we[0]), b * (e[1] + h * we[1]), b * (e[2] + h * we[2]))
 
 
 @njit(cache=True, nogil=True)
@@ -94,32 +134,35 @@ def advance(t1, whole_intervals, j, now, bias, readings, by, run, width, cov, co
     time [s] at which it is entered, and rate [rad/s] and specific force [m/s^2] (3,) at t1. Rate and force are of no
     use with `whole_intervals`.
     """
-    t, gyro, accel, linear = readings.t, readings.gyro, readings.accel, readings.linear
+    t = readings.t
     backwards, last, rate, force = t1 < now, len(t) - 2, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     while True:
-        is_last = (j <= 0 or t[j] <= t1) if backwards else (j >= last or t[j + 1] >= t1)
+        if backwards:
+            bound, is_outermost, is_last = t[j], j <= 0, t[j] <= t1 or (j <= 0 and now <= t[j])
+        else:
+            bound, is_outermost, is_last = t[j + 1], j >= last, t[j + 1] >= t1 or (j >= last and now >= t[j + 1])
         if is_last and whole_intervals:
             break
-        end = t1 if is_last else (t[j] if backwards else t[j + 1])
-        share = _share(t, j, 0.5 * (now + end)) if linear else 0.5
-        rate, force = corrected(gyro, accel, j, share, bias, by)
+        end = t1 if is_last else bound
         if end != now:
-            turn, by_turn = step(rate, force, end - now, by, run, width)
+            a, b = place_in_interval(t, j, now), place_in_interval(t, j, end)
+            rate, force, beyond = _effective(readings, j, a, b, end - now, bias, by)
+            turn, by_turn = step(rate, force, beyond, end - now, by, run, width)
             if len(cov) > 0:
                 add_covariance(turn, by_turn, end - now, readings.variance[j], readings.walk, run, cov, cov_t)
         if is_last:
-            if linear:
-                rate, force = corrected(gyro, accel, j, _share(t, j, t1), bias, by)
+            rate, force = corrected(readings, j, place_in_interval(t, j, t1), bias, by)
             break
         now = end
-        j += -1 if backwards else 1
+        if not is_outermost:
+            j += -1 if backwards else 1
     return j, now, rate, force
 
 
 @njit(cache=True, nogil=True)
-def _share(t, j, at):
-    """Fraction of the interval from stamp j to the next at time `at`, clipped to 0..1."""
-    return min(max((at - t[j]) / (t[j + 1] - t[j]), 0.0), 1.0)
+def place_in_interval(t, j, at):
+    """Where the time `at` is in interval j: -1/2 at its first stamp, 1/2 at its last, clipped to these."""
+    return min(max((at - t[j]) / (t[j + 1] - t[j]), 0.0), 1.0) - 0.5
 
 
 @njit(cache=True, nogil=True)
@@ -143,7 +186,7 @@ def integrate(t0, t1, first, bias, readings, by, workspace, out):
     interval `first`; overwrites `out`, an `Increment`.
 
     bias: six numbers; by: see `correction`; workspace: see `integration_workspace`. Beyond the recording, the first or
-    last interval is extrapolated. Returns the corrected rate (3,) and specific force (3,) at t1.
+    last reading holds. Returns the corrected rate (3,) and specific force (3,) at t1.
     """
     run, cov, cov_t = workspace
     start(run)
@@ -164,6 +207,6 @@ def integration_workspace(n):
     return np.empty(RUN_SIZE), np.empty(n), np.empty(n)
 
 
-def readings_of(imu: ImuData, linear: bool) -> Readings:
-    """`imu` as arrays for kernels; linear: see `Readings`."""
-    return Readings(imu.seconds, imu.gyro, imu.accel, imu.variance, imu.walk, linear)
+def readings_of(imu: ImuData) -> Readings:
+    """`imu` as arrays for kernels."""
+    return Readings(imu.seconds, *imu.signals, imu.variance, imu.walk)

@@ -72,6 +72,12 @@ def times(m, x):
 
 
 @njit(cache=True, nogil=True)
+def cross(x, y):
+    """x x y of two vectors."""
+    return x[1] * y[2] - x[2] * y[1], x[2] * y[0] - x[0] * y[2], x[0] * y[1] - x[1] * y[0]
+
+
+@njit(cache=True, nogil=True)
 def row_times(x, m):
     """x^T m of a vector and a matrix."""
     return (
@@ -153,9 +159,9 @@ def _series_slope(phi, f, products, c1, c2, d1, d2):
 
 
 @njit(cache=True, nogil=True)
-def step(rate, force, dt, by, run, width):
-    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`. Returns the arguments that
-    `carry` needs.
+def step(rate, force, beyond, dt, by, run, width):
+    """Advances `run` by dt (either sign) of constant body `rate` and specific `force`, and by the displacement `beyond`
+    (3,) [m] that their variation adds. Returns the arguments that `carry` needs.
 
     run: increments and derivatives, laid out as above. by: see `correction`, read only if derivatives are wanted.
     width: columns of J to advance: 0 none, 6 biases, more: IMU intrinsics too.
@@ -164,9 +170,10 @@ def step(rate, force, dt, by, run, width):
     x = phi[0] * phi[0] + phi[1] * phi[1] + phi[2] * phi[2]
     s0, s1, s2, s3 = so3.jacobian_coefficients(x)
     products = _products(phi, force)
-    g1, g2 = _sum3(1.0, force, s1, products[0], s2, products[1]), _sum3(0.5, force, s2, products[0], s3, products[1])
+    g1, p = _sum3(1.0, force, s1, products[0], s2, products[1]), _sum3(0.5, force, s2, products[0], s3, products[1])
+    p = _sum3(dt * dt, p, 1.0, beyond, 0.0, beyond)
     turn, R = _series(phi, 1.0, s0, s1), (run[0], run[1], run[2], run[3], run[4], run[5], run[6], run[7], run[8])
-    by_turn = _scaled(-dt, _times_cross(R, g1)), _scaled(-dt * dt, _times_cross(R, g2))
+    by_turn = _scaled(-dt, _times_cross(R, g1)), _scaled(-1.0, _times_cross(R, p))
     if width > 0:
         d1, d2, d3 = _coefficient_slopes(x, s1, s2, s3)
         slope1 = _series_slope(phi, force, products, s1, s2, d1, d2)
@@ -177,12 +184,12 @@ def step(rate, force, dt, by, run, width):
         if width > 6:
             fill_intrinsics(rate, force, by, run)
             _add_intrinsics(run)
-    v, p = times(R, g1), times(R, g2)
+    v, p = times(R, g1), times(R, p)
     for i in range(3):
         row = run[3 * i], run[3 * i + 1], run[3 * i + 2]
         run[3 * i], run[3 * i + 1], run[3 * i + 2] = row_times(row, turn)
     for i in range(3):
-        run[AT_P + i] += run[AT_V + i] * dt + dt * dt * p[i]
+        run[AT_P + i] += run[AT_V + i] * dt + p[i]
         run[AT_V + i] += dt * v[i]
     return turn, by_turn
 

@@ -17,7 +17,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.imu_data import SAME_INSTANT_S, ImuData
-from icalib.motion.integration import bias_of, corrected, readings_of
+from icalib.motion.integration import bias_of, corrected, place_in_interval, readings_of
 from icalib.motion.integration_step import (
     AT_INTRINSICS,
     AT_J,
@@ -167,8 +167,8 @@ def _kinematic(times, keyframe, first, keyframes, readings, intrinsics, at, Jn, 
     for i in range(len(times)):
         k, j, t = keyframe[i], first[i], readings.t
         dt = times[i] - keyframes.seconds[k]
-        share = (keyframes.seconds[k] - t[j]) / (t[j + 1] - t[j])
-        w, f = corrected(readings.gyro, readings.accel, j, share, bias_of(keyframes.bias, k), by)
+        at_keyframe = place_in_interval(t, j, keyframes.seconds[k])
+        w, f = corrected(readings, j, at_keyframe, bias_of(keyframes.bias, k), by)
         for a in range(3):
             turn[a] = w[a] * dt
         increment, Jr = so3.exp(turn), so3.right_jacobian(turn)
@@ -262,7 +262,7 @@ def poses_at(
         _between(times, keyframe, keyframes, at, J_keyframe, J_next)
     else:
         first, intrinsics = imu.interval(state.seconds[keyframe]), state.values[imu.name, "intrinsics"]
-        _kinematic(times, keyframe, first, keyframes, readings_of(imu, True), intrinsics, at, J_keyframe, J_imu)
+        _kinematic(times, keyframe, first, keyframes, readings_of(imu), intrinsics, at, J_keyframe, J_imu)
     return Poses(*at, J_keyframe, J_next, J_imu)
 
 
@@ -308,5 +308,5 @@ def _propagated(
     query, keyframes = propagation_query(state, times, keyframe, imu), keyframes_of(state, gravity)
     at = ImuMotion(out.rotation, out.position, out.rate, out.velocity)
     intrinsics = state.values[imu.name, "intrinsics"]
-    _inertial(query, keyframes, readings_of(imu, True), intrinsics, at, out.J_keyframe, out.J_imu, derivatives)
+    _inertial(query, keyframes, readings_of(imu), intrinsics, at, out.J_keyframe, out.J_imu, derivatives)
     return out

@@ -13,6 +13,8 @@ from icalib.sensors.parameter_spec import AXES, ParameterSpec
 
 T = TypeVar("T")
 TimeUnit = Literal["s", "ms", "us", "ns"]
+# A reading is a sample at its stamp, or the mean over the interval that ends there.
+Sampling = Literal["interval-mean", "instantaneous"]
 Axes = tuple[str, str, str]  # recorded columns that become x, y, z, with signs: ("x", "-y", "-z")
 
 ROTATION = ParameterSpec(

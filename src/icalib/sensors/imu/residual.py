@@ -246,7 +246,7 @@ class ImuFactor(RowFactor):
         half = n // 2
         in_parallel(
             lambda ks: _preintegrate(
-                ks[0], ks[1], state.seconds, first, readings_of(imu, False), bias0, intrinsics, *arrays
+                ks[0], ks[1], state.seconds, first, readings_of(imu), bias0, intrinsics, *arrays
             ),
             [(0, half), (half, n)],
         )  # fmt: skip

@@ -9,11 +9,11 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.fields import TABLE, axes_or_none, layout_to_plain, table_layout
+from icalib.sensors.fields import TABLE, axes_or_none, choice_or, layout_to_plain, table_layout
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.parameter_fields import parameter_to_plain, vector_parameter
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sensor, TableLayout
+from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sampling, Sensor, TableLayout
 
 
 @dataclass(frozen=True)
@@ -141,14 +141,15 @@ GyroUnit = Literal["rad/s", "deg/s"]
 BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
-_FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes")
+_FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
 
 
 @dataclass(frozen=True)
 class ImuSensor(Sensor):
     """An IMU.
 
-    Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
+    Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame. sampling:
+    `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
     assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
     `motion.imu_model`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
     prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU.
@@ -169,6 +170,7 @@ class ImuSensor(Sensor):
     gyro_unit: GyroUnit | None = None
     accel_axes: Axes | None = None
     gyro_axes: Axes | None = None
+    sampling: Sampling = "instantaneous"
     assumed: bool = False
     pose_keyframes_s: float = 0.02  # interval between keyframes if the motion is determined by poses alone
     layout: TableLayout = PLAIN_TABLE
@@ -198,6 +200,7 @@ class ImuSensor(Sensor):
             topic=_source(fields["topic"]) if "topic" in fields else None,
             accel_axes=axes_or_none(fields, "accel_axes"),
             gyro_axes=axes_or_none(fields, "gyro_axes"),
+            sampling=choice_or(fields, "sampling", Sampling, cls.sampling),
             layout=table_layout(fields),
             **units,
             **groups,

@@ -24,7 +24,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter, check_sizes
 from icalib.sensors.parameter_spec import ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sensor, TableLayout
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sampling, Sensor, TableLayout
 
 WheelFactor = Literal["increments", "relative-poses"]
 WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
@@ -154,7 +154,7 @@ class Wheels(MountedSensor):
     vertical_slip: float = 5e-3  # m/sqrt(s), off the ground
     factor: WheelFactor = "increments"  # relative-poses: equation (27) of the iCalib paper
     measures: WheelMeasure = "rates"
-    sampling: Literal["interval-mean", "instantaneous"] = "interval-mean"
+    sampling: Sampling = "interval-mean"
     counts_per_turn: float | None = None  # ticks per turn of the wheel
     signs: tuple[int, ...] | None = None  # 1 or -1 for each column of the table or each joint; None: all 1
     rate_unit: RateUnit = "rad/s"  # unit of rates
@@ -223,7 +223,7 @@ class Wheels(MountedSensor):
             drive=drive,
             factor=choice_or(fields, "factor", WheelFactor, "relative-poses" if measures == "poses" else cls.factor),
             measures=measures,
-            sampling=choice_or(fields, "sampling", Literal["interval-mean", "instantaneous"], cls.sampling),
+            sampling=choice_or(fields, "sampling", Sampling, cls.sampling),
             counts_per_turn=fields["counts_per_turn"].positive() if "counts_per_turn" in fields else None,
             counter_size=fields["counter_size"].whole(2) if "counter_size" in fields else None,
             angle_range=fields["angle_range"].positive() if "angle_range" in fields else None,

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.geometry.targets import NoTarget
 from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
-from icalib.sensors.sensor import mounted
+from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
 from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
@@ -61,8 +61,10 @@ def rig_for(
         raise TypeError(f"no group of parameters is called {min(unknown)}.")
     sensors = [_treated(s, true_values(scenario, sims[s.name]), treated, others) for s in plain]
     imu_intrinsics = _parameter(treated["imu_intrinsics"], scenario.imu_intrinsics)
+    sampling: Sampling = "interval-mean" if scenario.imu_sampling == "interval-mean" else "instantaneous"
+    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, imu_intrinsics, sampling=sampling)
     return Rig(
-        by_name(ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, imu_intrinsics), *sensors),
+        by_name(imu, *sensors),
         replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
         settings=settings_for(scenario) if settings is None else settings,

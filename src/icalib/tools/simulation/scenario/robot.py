@@ -44,14 +44,9 @@ class Drive:
 
     sideslip_deg: largest angle between the wheel frame's x axis and its velocity, which oscillates at 0.5 to 2 Hz:
     lateral slip of the wheels.
-
-    exact: the true trajectory is the exact integral of angular rates and specific forces that are constant between
-    readings, with the mean of the two readings. Feedback keeps it near the closed form. A wheel frame then slips by up
-    to 1 mm/s (0.2 mm/s RMS). Without `exact`, readings sample the closed form.
     """
 
     kind: DriveKind = "free"
-    exact: bool = False
     axis_imu: tuple[float, float, float] = (0.0, 0.0, 1.0)
     path: Path | None = None
     sideslip_deg: float = 0.0

@@ -19,6 +19,7 @@ from icalib.tools.simulation.scenario.sensor import SimSensor
 
 Kind = TypeVar("Kind", bound=SimSensor)
 
+ImuSampling = Literal["instantaneous", "low-pass", "interval-mean"]  # see `sensors.imu.ideal_readings`
 MotionKind = Literal["handheld", "planar", "single_axis", "motionless"]
 Interval = tuple[float, float]  # (start, end) in seconds on the IMU's clock, since its origin
 
@@ -109,13 +110,10 @@ class HandheldMotion:
 
     handheld: all axes. planar: yaw about the world's z, and translation along its x and y. single_axis: rotation about
     `axis_imu` only, translation along all axes. motionless: none. rotation_scale, translation_scale: factors on the
-    amplitudes, which give about 1.1 rad/s and 4.7 m/s^2 RMS. exact: the true trajectory is the exact integral of
-    angular rates and specific forces that are constant between readings, with the mean of the two readings. Without
-    `exact`, readings sample a trajectory in closed form.
+    amplitudes, which give about 1.1 rad/s and 4.7 m/s^2 RMS.
     """
 
     kind: MotionKind = "handheld"
-    exact: bool = True
     distance_m: float = 0.8
     rotation_scale: float = 1.0
     translation_scale: float = 1.0
@@ -156,6 +154,7 @@ class Scenario:
     accel_bias: tuple[float, float, float] = (-0.03, 0.11, 0.08)  # m/s^2
     imu_intrinsics: np.ndarray = field(default_factory=lambda: np.zeros(24))
     imu_clock_origin_ns: int = 0
+    imu_sampling: ImuSampling = "instantaneous"
     imu_jitter_s: float = 0.0  # readings taken at instants shifted by uniform +-imu_jitter_s, below half a period
     imu_gaps: tuple[Interval, ...] = ()  # readings inside are lost
     corner_noise_enabled: bool = True  # white, blur and shift
@@ -216,20 +215,18 @@ def handheld(
     duration_s: float = 20.0,
     asynchronous: bool = False,
     imu: Literal["datasheet", "noisy"] = "datasheet",
-    exact: bool = True,
     noiseless: bool = False,
 ) -> Scenario:
     """The EuRoC sensor unit (two radtan cameras at 20 Hz, ADIS16448 at 200 Hz), moved by hand in front of its
     AprilGrid.
 
     asynchronous: cam1 takes its images half a period after cam0. imu "noisy": ten times the data sheet's densities.
-    exact: see `HandheldMotion`. noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
+    noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
     """
     scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
     return Scenario(
         _euroc_cameras(phase_s=0.025 if asynchronous else 0.0),
         duration_s=duration_s,
-        motion=HandheldMotion(exact=exact),
         imu_noise=replace(ADIS16448.scaled(scale), source="simulation"),
         imu_noise_enabled=not noiseless,
         corner_noise_enabled=not noiseless,

@@ -15,13 +15,14 @@ from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS
 from icalib.rig import ImuNoise
 from icalib.sensors import SENSOR_KINDS
+from icalib.sensors.fields import choice_or
 from icalib.tools.simulation.scenario.effects import read_effects
 from icalib.tools.simulation.scenario.fields import at_least, intervals, mounted_fields, pose, share, triple
 from icalib.tools.simulation.scenario.image_faults import ImageFaults
 from icalib.tools.simulation.scenario.projection import PARAMETER_COUNTS
 from icalib.tools.simulation.scenario.robot import Drive, DriveKind, Features
 from icalib.tools.simulation.scenario.room import Obstacle, Room, hills_of_slope
-from icalib.tools.simulation.scenario.scenario import MODELS, Scenario, SimCamera
+from icalib.tools.simulation.scenario.scenario import MODELS, ImuSampling, Scenario, SimCamera
 from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
 from icalib.tools.simulation.scenario.size import refuse_large
 from icalib.tools.simulation.scenario.texture import Texture
@@ -108,11 +109,12 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
 def _imu(name: str, value: YamlValue) -> dict[str, Any]:
     if name != "imu0":
         value.fail("the IMU must be called imu0; rename it.")
-    fields = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias"))
+    fields = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias", "sampling"))
     densities = fields["noise"].record(_DENSITIES)
     noise = ImuNoise(**{name: densities[name].positive() for name in _DENSITIES}, source="scenario")
     biases = {key: tuple(fields[key].vector(3).tolist()) for key in ("gyro_bias", "accel_bias") if key in fields}
-    return {"imu_rate_hz": fields["rate"].positive(), "imu_noise": noise} | biases
+    sampling = choice_or(fields, "sampling", ImuSampling, Scenario.imu_sampling)
+    return {"imu_rate_hz": fields["rate"].positive(), "imu_noise": noise, "imu_sampling": sampling} | biases
 
 
 def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
@@ -178,10 +180,8 @@ def _block(value: YamlValue) -> Obstacle:
 
 
 def _motion(value: YamlValue, folder: Path) -> Drive:
-    fields = value.record(("kind",), ("exact", "axis_imu", "path", "sideslip_deg", "seed"))
+    fields = value.record(("kind",), ("axis_imu", "path", "sideslip_deg", "seed"))
     chosen: dict[str, Any] = {"kind": fields["kind"].choice("motion", get_args(DriveKind))}
-    if "exact" in fields:
-        chosen["exact"] = fields["exact"].boolean()
     if "axis_imu" in fields:
         chosen["axis_imu"] = tuple(fields["axis_imu"].vector(3).tolist())
         if not any(chosen["axis_imu"]):

@@ -23,7 +23,7 @@ _PLACES = (
 _GRID_PLACE = (1.00, 0.55, -15.0)  # on the first wall
 
 
-def tag_map(duration_s: float = 20.0, exact: bool = True, noiseless: bool = False, with_grid: bool = False) -> Scenario:
+def tag_map(duration_s: float = 20.0, noiseless: bool = False, with_grid: bool = False) -> Scenario:
     """The rig of `handheld`, moved by hand 1.7 m in front of a room's corner with twelve tags of 0.16 m. Each image
     shows at least 3 tags. with_grid: the target is a scene of these tags ("tags") and an AprilGrid ("grid")."""
     T_world_bodies = np.stack([_pose(_TAGS, i, *place) for i in range(3) for place in _PLACES[i]])
@@ -31,7 +31,7 @@ def tag_map(duration_s: float = 20.0, exact: bool = True, noiseless: bool = Fals
     if with_grid:
         target = Scene(("tags", "grid"), (_TAGS, _GRID))
         T_world_bodies = np.concatenate([T_world_bodies, _pose(_GRID, 0, *_GRID_PLACE)[None]])
-    base = handheld(duration_s, exact=exact, noiseless=noiseless)
+    base = handheld(duration_s, noiseless=noiseless)
     motion = replace(base.motion, distance_m=1.7)
     return replace(base, target=target, motion=motion, T_world_board=_faced(), T_world_bodies=T_world_bodies)
 

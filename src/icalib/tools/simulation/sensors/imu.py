@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.tools.simulation.scenario.scenario import Interval, Scenario
+from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory
 from icalib.tools.simulation.sensors.motion import skew
 
+_QUADRATURE_NODES = 6  # a motion below the Nyquist frequency is averaged to rounding
 _LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # row and column indices of xx, yx, yy, zx, zy, zz
 
 
@@ -36,6 +38,28 @@ def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     seconds = np.arange(count) / scenario.imu_rate_hz
     seconds[1:] += rng.uniform(-scenario.imu_jitter_s, scenario.imu_jitter_s, count - 1)
     return np.round(seconds * 1e9).astype(np.int64)
+
+
+def ideal_readings(scenario: Scenario, trajectory: AnalyticTrajectory, seconds: np.ndarray) -> np.ndarray:
+    """(N, 6) readings without errors at seconds (N,): angular rates [rad/s] and specific forces [m/s^2], sampled as
+    `Scenario.imu_sampling` says.
+
+    Means are those over the time since the reading before; the first one's over a period. The low-pass filter is Gaussian
+    and has no delay. Its amplitude is 1/sqrt(2) at half the rate.
+    """
+    period = 1.0 / scenario.imu_rate_hz
+    if scenario.imu_sampling == "instantaneous":
+        return trajectory.readings_at(seconds)
+    if scenario.imu_sampling == "interval-mean":
+        steps = np.diff(seconds, prepend=seconds[0] - period)
+        nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
+        shifts = [0.5 * steps * (node - 1.0) for node in nodes]
+    else:
+        sigma_s = np.sqrt(np.log(2.0)) * period / np.pi
+        nodes, weights = np.polynomial.hermite_e.hermegauss(_QUADRATURE_NODES)
+        shifts = [np.full(len(seconds), sigma_s * node) for node in nodes]
+    shares = weights / weights.sum()
+    return np.sum([w * trajectory.readings_at(seconds + s) for w, s in zip(shares, shifts, strict=True)], axis=0)
 
 
 def distort(intrinsics: np.ndarray, true: np.ndarray) -> np.ndarray:

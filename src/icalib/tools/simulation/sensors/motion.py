@@ -1,4 +1,4 @@
-"""True trajectories of the IMU: a reference in closed form, and the exact integral of piecewise constant readings.
+"""True trajectories of the IMU in closed form.
 
 Frames: world (z up), imu. Angular rates w and specific forces f are in the imu frame: R' = R [w]x, v' = R f + g,
 p' = v.
@@ -17,8 +17,6 @@ _ANGLES_RAD = np.array([[0.45, 0.22, 0.18], [0.12, 0.09, 0.08]])  # slow, fast s
 _YAW_RAD = np.array([[0.25, 0.0, 0.0], [0.10, 0.0, 0.0]])
 _SHIFT_M = np.array([[0.15, 0.10, 0.15], [0.05, 0.04, 0.05]])
 _FREQUENCY_HZ = np.array([[0.30, 0.55], [0.80, 1.20]])  # range of the slow, of the fast sinusoid
-_STEER_ROTATION, _STEER_POSITION, _STEER_VELOCITY = 1.0, 1.0, 2.0  # 1/s, 1/s^2, 1/s
-_TAYLOR_ORDER = 10  # 0.2^11 / 11! = 5e-16: exact to rounding for steps up to 0.2 rad
 _AXIS_X, _AXIS_Y, _AXIS_Z = np.eye(3)
 
 
@@ -27,22 +25,6 @@ def skew(w: np.ndarray) -> np.ndarray:
     W = np.zeros((*w.shape[:-1], 3, 3))
     W[..., 2, 1], W[..., 0, 2], W[..., 1, 0] = w[..., 0], w[..., 1], w[..., 2]
     return W - np.swapaxes(W, -1, -2)
-
-
-def increments(rate: np.ndarray, force: np.ndarray, dt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Increments of rotation (..., 3, 3), velocity (..., 3) m/s and position (..., 3) m over dt (...) [s], without
-    gravity, in the body frame at the start.
-
-    rate (..., 3) [rad/s] and force (..., 3) [m/s^2] are constant in the body frame. The increments are the upper rows
-    of exp(A dt) with A = [[skew(rate), force, 0], [0, 0, 1], [0, 0, 0]], summed as a Taylor series.
-    """
-    A = np.zeros((*rate.shape[:-1], 5, 5))
-    A[..., :3, :3], A[..., :3, 3], A[..., 3, 4] = skew(rate), force, 1.0
-    A *= np.asarray(dt)[..., None, None]
-    total = identity = np.eye(5)
-    for order in range(_TAYLOR_ORDER, 0, -1):
-        total = identity + A @ total / order
-    return total[..., :3, :3], total[..., :3, 3], total[..., :3, 4]
 
 
 def readings_of(rotation: np.ndarray, rotation_rate: np.ndarray, acceleration: np.ndarray) -> np.ndarray:
@@ -163,65 +145,3 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
         _waves(motion.rotation_scale * angles, rng),
         _waves(motion.translation_scale * shifts, rng),
     )
-
-
-@dataclass(frozen=True, eq=False)
-class ExactTrajectory:
-    """Exact integral of readings (N, 6) at seconds (N,); between two readings their mean is constant. rotation:
-    R_world_imu; position [m] and velocity [m/s] in the world."""
-
-    seconds: np.ndarray
-    readings: np.ndarray
-    rotation: np.ndarray  # (N, 3, 3)
-    position: np.ndarray  # (N, 3)
-    velocity: np.ndarray  # (N, 3)
-
-    def pose_at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See `TrueTrajectory.pose_at`; beyond the ends, the readings of the outermost interval are constant."""
-        i, mean = self._interval(seconds)
-        dt = seconds - self.seconds[i]
-        return _advance((self.rotation[i], self.position[i], self.velocity[i]), mean, dt)
-
-    def rate_at(self, seconds: np.ndarray) -> np.ndarray:
-        """See `TrueTrajectory.rate_at`; at a reading, the rate of the interval that begins there."""
-        return self._interval(seconds)[1][:, :3]
-
-    def _interval(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Number (N,) of the interval between readings that contains each instant, and its rates and forces (N, 6)."""
-        i = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)
-        return i, 0.5 * (self.readings[i] + self.readings[i + 1])
-
-
-def _advance(
-    state: tuple[np.ndarray, np.ndarray, np.ndarray], mean: np.ndarray, dt: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation (..., 3, 3), position and velocity (..., 3) after dt (...) [s] from `state`, with constant angular rate
-    and specific force mean (..., 6)."""
-    R, p, v = state
-    dR, dv, dp = increments(mean[..., :3], mean[..., 3:], dt)
-    dt = np.asarray(dt)[..., None]
-    return (
-        R @ dR,
-        p + v * dt + 0.5 * GRAVITY_WORLD * dt**2 + (R @ dp[..., None])[..., 0],
-        v + GRAVITY_WORLD * dt + (R @ dv[..., None])[..., 0],
-    )
-
-
-def exact_motion(reference: AnalyticTrajectory, seconds: np.ndarray) -> ExactTrajectory:
-    """Readings at seconds (N,) near those of the reference, and their exact integral.
-
-    The integral would drift from the reference by the error of the trapezoidal rule. Each reading is therefore
-    corrected by feedback of the state's error one reading earlier, so that the rig stays in front of the board.
-    """
-    R_ref, p_ref, v_ref = reference.pose_at(seconds)
-    readings = reference.readings_at(seconds)
-    rotation, position, velocity = R_ref.copy(), p_ref.copy(), v_ref.copy()
-    for i in range(len(seconds) - 1):
-        R, p, v = rotation[i], position[i], velocity[i]
-        E = R.T @ R_ref[i]
-        turn = 0.5 * np.array([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
-        readings[i + 1, :3] += _STEER_ROTATION * turn
-        readings[i + 1, 3:] += (_STEER_POSITION * (p_ref[i] - p) + _STEER_VELOCITY * (v_ref[i] - v)) @ R
-        mean = 0.5 * (readings[i] + readings[i + 1])
-        rotation[i + 1], position[i + 1], velocity[i + 1] = _advance((R, p, v), mean, seconds[i + 1] - seconds[i])
-    return ExactTrajectory(seconds, readings, rotation, position, velocity)

@@ -17,8 +17,8 @@ from icalib.tools.simulation.scenario.sensor import Report, SimScene, SimSensor
 from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory, TrueTrajectory
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
 from icalib.tools.simulation.sensors.drives import drive_motion
-from icalib.tools.simulation.sensors.imu import imu_stamps, inside, read_imu
-from icalib.tools.simulation.sensors.motion import exact_motion, reference_motion
+from icalib.tools.simulation.sensors.imu import ideal_readings, imu_stamps, inside, read_imu
+from icalib.tools.simulation.sensors.motion import reference_motion
 from icalib.tools.simulation.sensors.tracks import SimulatedTracks, TrackTruth, follow
 
 Progress = Callable[[str, float], None]  # called with the current step, and the progress of the whole, 0 to 1
@@ -91,8 +91,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     imu_rng = np.random.default_rng([seed, 1])
     stamps = imu_stamps(scenario, imu_rng)
     seconds = stamps.astype(np.float64) * 1e-9
-    trajectory, ideal = _motion(scenario, seed, seconds)
-    readings = read_imu(scenario, seconds, ideal, imu_rng)
+    trajectory = _motion(scenario, seed)
+    readings = read_imu(scenario, seconds, ideal_readings(scenario, trajectory, seconds), imu_rng)
     kept = ~inside(scenario.imu_gaps, seconds)
     stamps_ns = stamps[kept] + np.int64(scenario.imu_clock_origin_ns)
     imu = ImuStream("imu0", stamps_ns, readings.gyro[kept], readings.accel[kept])
@@ -122,22 +122,15 @@ def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, 
     return mounted(T[:3, :3], T[:3, 3], offset) | sensor.values()
 
 
-def _motion(scenario: Scenario, seed: int, seconds: np.ndarray) -> tuple[TrueTrajectory, np.ndarray]:
-    """The true trajectory, and the readings (N, 6) of an IMU without errors at seconds (N,): angular rates [rad/s] and
-    specific forces [m/s^2]."""
+def _motion(scenario: Scenario, seed: int) -> AnalyticTrajectory:
+    """The true trajectory."""
     motion = scenario.motion
     rng = np.random.default_rng([seed if motion.seed is None else motion.seed, 0])
-    reference: AnalyticTrajectory
     if isinstance(motion, HandheldMotion):
-        reference = reference_motion(scenario, rng)
-    else:
-        assert scenario.room is not None  # `Scenario` sees to it
-        T_imu_rolling = next((s.T_imu_sensor for s in scenario.sensors if s.rolls), None)
-        reference = drive_motion(motion, scenario.room, T_imu_rolling, scenario.duration_s, rng)
-    if motion.exact:
-        trajectory = exact_motion(reference, seconds)
-        return trajectory, trajectory.readings
-    return reference, reference.readings_at(seconds)
+        return reference_motion(scenario, rng)
+    assert scenario.room is not None  # `Scenario` sees to it
+    T_imu_rolling = next((s.T_imu_sensor for s in scenario.sensors if s.rolls), None)
+    return drive_motion(motion, scenario.room, T_imu_rolling, scenario.duration_s, rng)
 
 
 def _corners(
