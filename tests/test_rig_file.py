@@ -110,7 +110,7 @@ def test_everything_is_read(tmp_path):
         None,
     )
     target = instance(rig.target, AprilGrid)
-    assert (target.cols, target.tag_size, rig.gravity) == (7, 0.088, 9.80665)
+    assert (target.cols, target.tag_size, rig.gravity, rig.gravity_sigma) == (7, 0.088, 9.80665, 0.0)
     s = rig.settings
     assert (s.scheme, s.loss, s.segments, s.bloom, s.outlier_std) == ("pose", "cauchy", 0, False, 4.0)
     assert rig.path == tmp_path / "rig.yaml"
@@ -119,7 +119,7 @@ def test_everything_is_read(tmp_path):
 def test_defaults(tmp_path):
     text = VALID[: VALID.index("gravity")].replace(VALID.splitlines(keepends=True)[3], "")
     rig = load(tmp_path, text)
-    assert rig.gravity == 9.81 and rig.settings == Rig.settings
+    assert (rig.gravity, rig.gravity_sigma) == (9.806, 0.02) and rig.settings == Rig.settings
     assert not_none(rig.imu).noise.source == "default for a consumer IMU"
 
 

@@ -42,6 +42,7 @@ from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
 TOLERANCE = {
+    "gravity": 0.01,
     "rotation": 2e-3,
     "translation": 5e-3,
     "time_offset": 1e-3,

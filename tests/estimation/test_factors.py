@@ -74,13 +74,22 @@ def in_unit(setup):
     return replace(setup, imu=replace(setup.imu, unit=SIZE), state=replace(setup.state, values=values))
 
 
+def with_gravity(setup):
+    """The setup with the magnitude of gravity estimated."""
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    layout = make_layout([*entries, ("world", "gravity", "nuisance", 1, True)])
+    values = setup.state.values | {("world", "gravity"): np.array([9.79])}
+    return replace(setup, layout=layout, state=replace(setup.state, values=values))
+
+
 def imu_sample(unlike, setup_of, imu_free, unit=False):
     """Preintegrated at another state, so that the corrections by bias and intrinsics are not zero."""
     setup = setup_of(unlike, imu_free=imu_free, size=unit)
-    setup = in_unit(setup) if unit else setup
+    setup = in_unit(setup) if unit else with_gravity(setup)
     columns = setup.layout.columns("imu0", "intrinsics")
     columns = np.concatenate([columns[columns >= 0], setup.imu.unit_columns(setup.layout)])
-    factor = ImuFactor.build(setup.imu, setup.state, 9.81, columns)
+    last = setup.layout.columns("world", "gravity") if not unit else columns[:0]
+    factor = ImuFactor.build(setup.imu, setup.state, 0.0 if unit else 9.81, columns, last)
     state = setup.perturbed(np.random.default_rng(0), 0.1)
 
     def residual(at):

@@ -217,7 +217,7 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     if not motion_kinds(rig)[0].hosts_keyframes:
         motion = SmoothMotion(paths, float(turning), float(jerking))
         imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))
-    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **identity), gravity=0.0)
+    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **identity), gravity=0.0, gravity_sigma=0.0)
 
 
 def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from icalib.errors import RigError
 from icalib.geometry.targets import NoTarget, Target
+from icalib.rig.gravity import ANYWHERE
 from icalib.rig.settings import Settings
 from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.spec import Camera
@@ -40,8 +41,8 @@ def by_name(*sensors: Sensor) -> dict[str, Sensor]:
 class Rig:
     """All sensors of a robot, the target that they see, and the settings of the estimator.
 
-    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity: magnitude
-    [m/s^2]. path: the rig file, None if not read from one. body: name of the sensor in whose frame results give poses;
+    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity, gravity_sigma:
+    magnitude and its standard deviation [m/s^2]; 0: exact. path: the rig file, None if not read from one. body: name of the sensor in whose frame results give poses;
     empty: `reference`.
 
     The reference is the IMU, or without one the first sensor that determines the motion (`reference_without_imu`). A
@@ -51,7 +52,8 @@ class Rig:
 
     sensors: Mapping[str, Sensor]
     target: Target = NoTarget()
-    gravity: float = 9.81
+    gravity: float = ANYWHERE.value
+    gravity_sigma: float = ANYWHERE.sigma
     settings: Settings = Settings()
     path: Path | None = None
     body: str = ""

@@ -9,6 +9,9 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 # True length / length in the rig file, of all lengths of the target.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
+# Magnitude of gravity, see `rig.gravity`; it belongs to the WORLD.
+WORLD = "world"
+GRAVITY = ParameterSpec("gravity", 1, "nuisance", "m/s^2", ("gravity",), 1e-2, 0.1)
 # Out-of-plane deviation of a body from its design, second order in x, y; basis: `model.bodies.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
 # In-plane deviations by printing and mounting, to second order in x, y. Rotation and translation are omitted, as they
@@ -56,4 +59,4 @@ FRAME_OFFSET = ParameterSpec("frame_offset", 3, "vector", "m", AXES, 0.5, 10.0)
 FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's static frame in the world frame
 LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same for a frame whose z axis is vertical, as that of the world
 BODY = (ROTATION, TRANSLATION)  # pose of a body, if the target has several
-SCENE = (SIZE, TILT, SHAPE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)
+SCENE = (SIZE, GRAVITY, TILT, SHAPE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)

@@ -17,13 +17,13 @@ from icalib.motion.factor import Factor, keyed
 from icalib.motion.independent_keyframes import IndependentKeyframes
 from icalib.motion.keyframe_placement import distinct, first_keyframes, place_keyframes
 from icalib.motion.poses import assign_keyframes, poses_at
-from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.sweep import EstimatedMotion, gravity_of
 from icalib.motion.time_offsets import RECORDING_MARGIN_S
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Block, Key, State
 from icalib.rig import Parameter, Rig, Sensor
-from icalib.rig.scene import SHAPE_LABELS
+from icalib.rig.scene import GRAVITY, SHAPE_LABELS, WORLD
 from icalib.sensors.sensor import TIME_OFFSET
 
 
@@ -50,13 +50,17 @@ def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """Priors on nuisance parameters: size of the target, IMU intrinsics, and scale of a pose sensor. `inputs.rig` holds
+    """Priors on nuisance parameters: size of the target, gravity, IMU intrinsics, and scale of a pose sensor. `inputs.rig` holds
     default priors if the user's rig file states none. The shape of a target is no nuisance parameter here."""
-    priors, one = [], np.ones(1)
+    rig, one, priors = inputs.rig, np.ones(1), []
+    of_scene = {
+        SIZE: (one, rig.target.size_sigma * one),
+        (WORLD, GRAVITY.name): (rig.gravity * one, rig.gravity_sigma * one),
+    }
     for block in inputs.layout.free:
         stated = inputs.stated(block)
-        if block.key == SIZE:
-            priors.append(Prior(block, one, inputs.rig.target.size_sigma * one))
+        if block.key in of_scene:
+            priors.append(Prior(block, *of_scene[block.key]))
         elif block.is_nuisance and stated is not None:
             priors += _given(block, stated)
     return tuple(priors)
@@ -111,7 +115,7 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     if inputs.imu is None:
         return state
     near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
-    poses = poses_at("inertial", keyframes, near, state, inputs.imu, inputs.rig.gravity, False)
+    poses = poses_at("inertial", keyframes, near, state, inputs.imu, gravity_of(state), False)
     starts = first_keyframes(inputs.imu, keyframes)
     return State(
         keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts
@@ -166,7 +170,7 @@ def assemble(
 def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
     """Motion of the IMU between the keyframes of `state`."""
     assert inputs.imu is not None
-    return EstimatedMotion(state, inputs.imu, inputs.rig.gravity, inputs.rig.settings.max_gap_s)
+    return EstimatedMotion(state, inputs.imu, gravity_of(state), inputs.rig.settings.max_gap_s)
 
 
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:
@@ -208,7 +212,7 @@ def _between_keyframes(inputs: Inputs, at: Pass) -> Iterable[Factor]:
 
 def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Key, np.ndarray]:
     """Values of all blocks: the guess, completed by start values of parameters that are not guessed."""
-    rig, values = inputs.rig, guess_values | {SIZE: np.ones(1)}
+    rig, values = inputs.rig, guess_values | {SIZE: np.ones(1), (WORLD, GRAVITY.name): np.full(1, inputs.rig.gravity)}
     for name in inputs.bodies.bending:
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
     for reference in inputs.bodies.names[:1]:

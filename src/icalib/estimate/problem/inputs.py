@@ -19,7 +19,7 @@ from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.plane_association import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
-from icalib.rig.scene import TILT
+from icalib.rig.scene import GRAVITY, TILT, WORLD
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,7 @@ def layout_for(
     entries: list[Entry] = []
     if imu is not None:
         entries += model_of(imu).entries(imu, rig, n_recordings)
+        entries.append(GRAVITY.entry(WORLD, rig.gravity_sigma > 0.0))
     # Without an IMU the frame of the target is the world frame of all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():

@@ -195,7 +195,7 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
     keyframe = keyframes_of(scheme, state, times, images, imu)
     used = are_used(imu, times, state.seconds[keyframe], rig.settings.max_gap_s)
     factor = CornerFactor(
-        stream, camera_model(camera.model), imu, rig.gravity, scheme, stream.seconds, keyframe,
+        stream, camera_model(camera.model), imu, 0.0 if at.motion is None else at.motion.gravity, scheme, stream.seconds, keyframe,
         noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
         len(state.seconds), tuple(recording_images.start for recording_images in images[1:]),
     )  # fmt: skip

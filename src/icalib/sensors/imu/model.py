@@ -9,6 +9,7 @@ import numpy as np
 from icalib.data.measurements import ImuStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.rig import ImuNoise, ImuSensor, Settings
+from icalib.rig.scene import GRAVITY, WORLD
 from icalib.sensors.imu.residual import ImuFactor
 
 
@@ -23,10 +24,10 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
     def factors(self, sensor: ImuSensor, stream: ImuStream, noise: ImuNoise, at: Pass) -> Iterator[ImuFactor]:
         """Yields the factor of all intervals between keyframes. The readings of `at` already contain the noise."""
         del stream, noise
-        assert at.imu is not None
-        columns = at.layout.columns(sensor.name, "intrinsics")
-        columns = np.concatenate([columns[columns >= 0], at.imu.unit_columns(at.layout)])
-        yield ImuFactor.build(at.imu, at.state, at.rig.gravity, columns)
+        assert at.motion is not None
+        intrinsics, gravity = at.layout.columns(sensor.name, "intrinsics"), at.layout.columns(WORLD, GRAVITY.name)
+        columns = np.concatenate([intrinsics[intrinsics >= 0], at.motion.imu.unit_columns(at.layout)])
+        yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, columns, gravity[gravity >= 0])
 
 
 MODEL = ImuModel()

@@ -19,6 +19,7 @@ from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.integration import Increment, bias_of, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
+from icalib.motion.sweep import gravity_of
 from icalib.optim import memory
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.prior_factor import accumulate_bias_prior
@@ -27,6 +28,7 @@ from icalib.optim.state import KEYFRAME_DIM, State
 
 N_ROWS = 15  # of an interval
 IS_LENGTH = np.array([False] * 3 + [True] * 6 + [False] * 3 + [True] * 3)  # (15,) rows in m, m/s and m/s^2
+NONE = np.zeros(0, dtype=np.int64)
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, N_ROWS)}
 
 
@@ -136,12 +138,25 @@ def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
             J[3 + i, c], J[6 + i, c] = -increments.J[k, 3 + i, j], -increments.J[k, 6 + i, j]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _last_column(k, chain, unit, r, J):
+    """Fills the last column of J: by gravity where there is some; by the unit of length of an assumed motion, which has
+    none."""
+    dt, last = chain.seconds[k + 1] - chain.seconds[k], J.shape[1] - 1
+    for i in range(3):
+        down = chain.R[k, 2, i]
+        if chain.gravity > 0.0:
+            J[3 + i, last], J[6 + i, last] = down * dt, 0.5 * down * dt * dt
+        else:
+            J[3 + i, last], J[6 + i, last], J[12 + i, last] = -r[3 + i] / unit, -r[6 + i] / unit, -r[12 + i] / unit
+
+
 @njit(cache=True, nogil=True)
 def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
     """Adds intervals `sums.first` to k1 - 1 to the normal equations, and fills whitened residuals out (K - 1, 15).
 
     dx (24 or 0,): changes of the intrinsics since preintegration. unit: see `ImuData`. columns: calibration columns of
-    the intrinsics, then of the unit if there is one. Returns half the chi^2. Without sums (empty arrays) only the
+    the intrinsics, then of the unit or of gravity. Returns half the chi^2. Without sums (empty arrays) only the
     residuals are filled.
     """
     width, W = KEYFRAME_PAIR_DIM + len(columns), np.zeros((N_ROWS, N_ROWS))
@@ -164,7 +179,7 @@ def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
         if with_sums:
             _jacobians(k, chain, increments, change, R01, hv, hp, r, J)
             if len(columns) > len(dx):
-                J[:, width - 1] = np.where(IS_LENGTH, -r / unit, 0.0)
+                _last_column(k, chain, unit, r, J)
             whiten(W, J, whitened)
             add_product(k - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost
@@ -186,8 +201,9 @@ class ImuFactor(RowFactor):
     """
 
     imu: ImuData
-    gravity: float  # [m/s^2]
+    gravity: float  # [m/s^2], where it is not estimated
     columns: np.ndarray  # (24 or 0,) calibration columns of free intrinsics, and that of the unit of length if any
+    gravity_column: np.ndarray  # (1,) that of the magnitude of gravity, or (0,)
     increments: Increments
     intrinsics0: np.ndarray  # (24,) at which the intervals were preintegrated
     starts: tuple[int, ...] = (0,)
@@ -229,7 +245,9 @@ class ImuFactor(RowFactor):
         return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in keyframes)
 
     @classmethod
-    def build(cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray) -> ImuFactor:
+    def build(
+        cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray, gravity_column: np.ndarray = NONE
+    ) -> ImuFactor:
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
         n = len(state.seconds) - 1
         width = 6 + len(columns) - (imu.unit is not None)
@@ -255,17 +273,18 @@ class ImuFactor(RowFactor):
         W[seams] = 0.0
         # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
         dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
-        return cls(imu, gravity, columns, Increments(*arrays, bias0), intrinsics, state.starts)
+        return cls(imu, gravity, columns, gravity_column, Increments(*arrays, bias0), intrinsics, state.starts)
 
     def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
         """See `Factor`."""
-        return ImuFactor.build(imu, state, self.gravity, self.columns)
+        return ImuFactor.build(imu, state, self.gravity, self.columns, self.gravity_column)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
         del curved
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0
         dx = dx if self.increments.J.shape[2] > 6 else np.zeros(0)
-        chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, self.gravity)
-        unit = self.imu.unit_length(state)
-        return _accumulate(piece.last, chain, self.increments, dx, unit, self.columns, piece.sums(sums), out.residual)
+        gravity = gravity_of(state) if len(self.gravity_column) else self.gravity
+        chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, gravity)
+        unit, columns = self.imu.unit_length(state), np.concatenate([self.columns, self.gravity_column])
+        return _accumulate(piece.last, chain, self.increments, dx, unit, columns, piece.sums(sums), out.residual)

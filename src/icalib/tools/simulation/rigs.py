@@ -67,6 +67,7 @@ def rig_for(
         by_name(imu, *sensors),
         replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
         gravity=float(np.linalg.norm(GRAVITY_WORLD)),
+        gravity_sigma=0.0,
         settings=settings_for(scenario) if settings is None else settings,
     )
 
