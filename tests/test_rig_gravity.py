@@ -23,7 +23,12 @@ def test_a_prior_comes_back():
 # Gravity at sea level: WGS84's own at equator and poles; gravimeters in Zurich (408 m) and Quito (2850 m).
 @pytest.mark.parametrize(
     ("latitude", "height", "expected", "within"),
-    [(0.0, 0.0, 9.7803253, 1e-7), (90.0, 0.0, 9.8321849, 1e-7), (47.4, 408.0, 9.8066, 1e-3), (-0.2, 2850.0, 9.7725, 2e-3)],
+    [
+        (0.0, 0.0, 9.7803253, 1e-7),
+        (90.0, 0.0, 9.8321849, 1e-7),
+        (47.4, 408.0, 9.8066, 1e-3),
+        (-0.2, 2850.0, 9.7725, 2e-3),
+    ],
 )
 def test_latitude_and_height_give_gravity(latitude, height, expected, within):
     assert gravity_at(latitude, height).value == pytest.approx(expected, abs=within)

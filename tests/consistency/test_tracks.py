@@ -49,9 +49,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     scenario = table2(8.0)
     exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
     # At 1000 Hz the error of the interpolation between readings is that of rounding.
-    scenario = replace(
-        scenario, **exact, imu_rate_hz=1000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3
-    )
+    scenario = replace(scenario, **exact, imu_rate_hz=1000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
     simulation, rig = simulate(scenario, 1), rig_of(scenario, 1.03)
     inputs = inputs_for(rig, [simulation.measurements])
     state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))

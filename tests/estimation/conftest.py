@@ -351,9 +351,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     return RoomSetup(sim, imu, make_layout(entries), planes, own[stream.plane], state)
 
 
-def room_scenario(
-    duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, **lidar
-) -> Scenario:
+def room_scenario(duration_s: float, *, example: str = "table2-3d", noiseless: bool = False, **lidar) -> Scenario:
     """The paper's robot with IMU and LiDAR alone, moving freely or as another example; `lidar`: changes of it."""
     scenario = load_scenario(PAPER / f"{example}.yaml")
     return replace(

@@ -128,8 +128,8 @@ SPANS = {
 @pytest.mark.parametrize("backwards", [False, True])
 @pytest.mark.parametrize("span", SPANS)
 def test_increments_are_products_of_matrix_exponentials(span, backwards, intrinsics):
-    """Steps of 2 to 11 ms, whose rates change by up to 3 rad/s. Second-order terms, here 2e-4 m/s, are those of readings
-    as recorded, and the intrinsics are errors of 2 %."""
+    """Steps of 2 to 11 ms, whose rates change by up to 3 rad/s. Second-order terms, here 2e-4 m/s, are those of
+    readings as recorded, and the intrinsics are errors of 2 %."""
     t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
     bias = BIAS if intrinsics is not None else np.zeros(6)
     if span == "whole":  # and a little beyond the last reading, which holds there
@@ -155,7 +155,7 @@ def wave_errors(rate_hz, sampling):
     nodes, weights = np.polynomial.legendre.leggauss(6)
     spread = [0.0] if sampling == "instantaneous" else 0.5 * period * (nodes - 1.0)
     weights = [1.0] if sampling == "instantaneous" else 0.5 * weights
-    x = sum(w * reference.readings_at(t + s) for w, s in zip(weights, spread, strict=True))
+    x = np.sum([w * reference.readings_at(t + s) for w, s in zip(weights, spread, strict=True)], axis=0)
     stream = ImuStream("imu0", np.round(t * 1e9).astype(np.int64), x[:, :3].copy(), x[:, 3:].copy())
     r = Irregular()
     imu = ImuData.build(stream, ImuNoise(1e-4, 1e-5, 1e-3, 1e-4), sampling=sampling)
@@ -331,9 +331,7 @@ def test_covariance_against_sampled_readings():
     R, v, p, _, P, _ = run(r, 0.0, r.t[-1], covariance=True)
 
     density, walk = np.sqrt(np.repeat(r.variance[0, :2], 3)), np.sqrt(np.repeat(r.walk, 3))
-    readings = r.values + density * np.sqrt(rate) * rng.normal(
-        size=(samples, n + 1, 6)
-    )
+    readings = r.values + density * np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
     steps = walk / np.sqrt(rate) * rng.normal(size=(samples, n + 1, 6))
     steps[:, 0] = 0.0
     wander = np.cumsum(steps, axis=1)

@@ -49,7 +49,7 @@ def errors(setup, state):
 
 
 def handheld_at_2000_hz(duration_s, asynchronous=False):
-    """At 200 Hz the interpolation between readings leaves 2e-8, and second-order terms as recorded 1.5e-8 at 1000 Hz."""
+    """At 200 Hz the interpolation leaves 2e-8; second-order terms of readings as recorded 1.5e-8 at 1000 Hz."""
     return replace(handheld(duration_s, asynchronous=asynchronous, noiseless=True), imu_rate_hz=2000.0)
 
 
@@ -88,7 +88,8 @@ def test_noiseless_recovery_with_biases(setup_of, problem_of, asynchronous):
 
 
 def test_noiseless_recovery_of_another_camera_model_and_the_imu_intrinsics(setup_of, problem_of, unlike):
-    setup = setup_of(simulate(without_bias(replace(unlike.scenario, duration_s=5.0, imu_rate_hz=2000.0)), seed=1), imu_free=True)
+    scenario = without_bias(replace(unlike.scenario, duration_s=5.0, imu_rate_hz=2000.0))
+    setup = setup_of(simulate(scenario, seed=1), imu_free=True)
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(3)), passes=4)
     assert too_large(setup, not_none(outcome).state, EXACT) == {}
 

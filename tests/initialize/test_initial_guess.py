@@ -275,9 +275,7 @@ def test_a_few_gross_outliers_cost_hardly_a_pose(simulation: Simulation):
 
 
 def test_one_axis_of_rotation_is_not_enough_and_said():
-    simulation = simulate(
-        dataclasses.replace(handheld(15.0), motion=HandheldMotion("single_axis")), 0
-    )
+    simulation = simulate(dataclasses.replace(handheld(15.0), motion=HandheldMotion("single_axis")), 0)
     assert "one axis" in failure(rig_for(simulation.scenario), simulation.measurements)
     initial_guess(rig_for(simulation.scenario, rotation="fixed"), simulation.measurements)
 

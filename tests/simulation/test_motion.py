@@ -8,6 +8,7 @@ from tests.typed import not_none
 
 from icalib.tools.simulation import handheld, simulate
 from icalib.tools.simulation.sensors.imu import ideal_readings
+from icalib.tools.simulation.sensors.motion import Reference
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 KINDS = ("handheld", "planar", "single_axis", "motionless")
@@ -50,7 +51,10 @@ def test_an_interval_mean_is_that_of_the_time_since_the_reading_before(jitter_s)
 
 @pytest.mark.parametrize(("frequency", "left"), [(2.0, np.exp(-np.log(2.0) / 2.0 * 0.04**2)), (50.0, np.sqrt(0.5))])
 def test_a_low_pass_has_no_delay_and_half_power_at_half_the_rate(frequency, left):
-    class Wave:
+    class Wave(Reference):
+        def __init__(self):
+            pass
+
         def readings_at(self, seconds):
             return np.sin(2.0 * np.pi * frequency * seconds + 0.4)[:, None] * np.ones(6)
 

@@ -36,8 +36,8 @@ def _along_first(dt: np.ndarray, x: np.ndarray) -> np.ndarray:
 def polynomial_means(t, x, spans, first, last, count, out):
     """Fills out (Q, m) with means of polynomials through samples x (N, m) at times t (N,).
 
-    spans (Q, 2): begin and end of each mean, which may coincide. The polynomial passes through the `count` samples around
-    the span, all from number first to last (Q,); through fewer if there are no more of them.
+    spans (Q, 2): begin and end of each mean, which may coincide. The polynomial passes through the `count` samples
+    around the span, of those from number first to last (Q,); through fewer if there are no more.
     """
     for q in range(len(spans)):
         n = min(count, last[q] - first[q] + 1)

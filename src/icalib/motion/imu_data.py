@@ -41,11 +41,10 @@ def clear_of(gaps: Iterable[tuple[float, float]], start: np.ndarray, end: np.nda
 class ImuData:
     """Readings on the IMU clock, seconds since its first stamp; gyro [rad/s], accel [m/s^2] (N, 3).
 
-    sampling: `instantaneous` readings are samples at their stamps; an `interval-mean` is that of the interval which ends
-    at its stamp.
-    variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and deviation of the
-    specific force from its mean within the interval. walk (2,): squared densities of the bias random walks. gaps:
-    (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where nothing is known.
+    sampling: `instantaneous` readings are samples at their stamps; an `interval-mean` is that of the interval which
+    ends at its stamp. variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and
+    deviation of the specific force from its mean within the interval. walk (2,): squared densities of the bias random
+    walks. gaps: (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where nothing is known.
     forwards: True if biases of a keyframe apply until the next one, so that motion is propagated forwards only. This is
     so if the readings are an assumption on the motion, whose biases change much between keyframes.
 
@@ -92,7 +91,7 @@ class ImuData:
 
     def interpolation_error(self) -> np.ndarray:
         """(N - 1, 2) estimated RMS error of `signals` in the mean rate [rad/s] and force [m/s^2] of each interval: the
-        difference to a polynomial through QUINTIC readings, averaged over the axes. Noise contributes 4 % of its own size."""
+        difference to a polynomial through QUINTIC readings, averaged over the axes. Noise adds 4 % of its own size."""
         if self.sampling == "interval-mean":
             return np.zeros((len(self.seconds) - 1, 2))
         values, means = self.signals

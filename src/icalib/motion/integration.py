@@ -1,16 +1,16 @@
 """Integration of IMU readings between two instants, forwards or backwards, with Jacobians and covariance.
 
-Readings sample band-limited signals. Between two stamps each is the parabola through both readings whose mean is that of
-the signal (`ImuData.signals`). A step takes this mean over its part of the interval as constant, and adds the second-order
-terms of the variation: coning, sculling and scrolling (Savage, Strapdown inertial navigation integration algorithm
-design, JGCD 1998). With the changes d of the rate and e of the force over a step of dt,
+Readings sample band-limited signals. Between two stamps each is the parabola through both readings whose mean is that
+of the signal (`ImuData.signals`). A step takes this mean over its part of the interval as constant, and adds the
+second-order terms of the variation: coning, sculling and scrolling (Savage, Strapdown inertial navigation integration
+algorithm design, JGCD 1998). With the changes d of the rate and e of the force over a step of dt,
 
     w <- w + dt (w x d) / 12
     f <- f + dt (w x e + f x d) / 12
     p <- p - dt^2 (e + dt (w x e) / 2) / 12
 
-The vectors in these terms are readings as recorded. Biases and intrinsics would change them by less than noise does, and
-Jacobians stay exact.
+The vectors in these terms are readings as recorded. Biases and intrinsics would change them by less than noise does,
+and Jacobians stay exact.
 
 Increments are relative to the start: R_0^T R_1; R_0^T (v_1 - v_0 - g T); R_0^T (p_1 - p_0 - v_0 T - g T^2/2). Errors
 are rotation (on the right), velocity, position, gyroscope bias, accelerometer bias, in this order.
@@ -43,8 +43,8 @@ from icalib.motion.integration_step import (
 
 
 class Readings(NamedTuple):
-    """t (N,) seconds on the IMU clock; values (N, 6): rates [rad/s] and specific forces [m/s^2] at the stamps; means (N -
-    1, 6): of each interval; variance (N - 1, 3), walk (2,): see `ImuData`."""
+    """t (N,) seconds on the IMU clock; values (N, 6): rates [rad/s] and specific forces [m/s^2] at the stamps; means
+    (N - 1, 6): of each interval; variance (N - 1, 3), walk (2,): see `ImuData`."""
 
     t: np.ndarray
     values: np.ndarray
@@ -66,7 +66,7 @@ class Increment(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _part(readings, j, c, a, b):
-    """Mean and change of signal c (0 to 5) from a to b in interval j; a, b: -1/2 at its first stamp, 1/2 at its last."""
+    """Mean and change of signal c (0 to 5) from a to b in interval j; -1/2 is its first stamp, 1/2 its last."""
     x0, x1, mean = readings.values[j, c], readings.values[j + 1, c], readings.means[j, c]
     slope, bend = x1 - x0, 3.0 * (x0 + x1) - 6.0 * mean
     return (

@@ -29,7 +29,9 @@ class EstimatedMotion:
     """Motion of the IMU between the keyframes of `state`.
 
     gravity [m/s^2]: a constant within a pass, unlike that of the IMU factor. Sensors are 25 ms from a keyframe at most;
-    its standard deviation of 0.02 m/s^2 moves them by 6 um before the next pass. IMU gaps up to max_gap_s are bridged."""
+    its standard deviation of 0.02 m/s^2 moves them by 6 um before the next pass. IMU gaps up to max_gap_s are
+    bridged.
+    """
 
     state: State
     imu: ImuData

@@ -42,8 +42,8 @@ class Rig:
     """All sensors of a robot, the target that they see, and the settings of the estimator.
 
     sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity, gravity_sigma:
-    magnitude and its standard deviation [m/s^2]; 0: exact. path: the rig file, None if not read from one. body: name of the sensor in whose frame results give poses;
-    empty: `reference`.
+    magnitude and its standard deviation [m/s^2]; 0: exact. path: the rig file, None if not read from one. body: name of
+    the sensor in whose frame results give poses; empty: `reference`.
 
     The reference is the IMU, or without one the first sensor that determines the motion (`reference_without_imu`). A
     rig with cameras only has no motion model: images with the same stamp share a pose, and poses are independent. Any

@@ -50,8 +50,9 @@ def stated_priors(inputs: Inputs) -> tuple[Prior, ...]:
 
 
 def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
-    """Priors on nuisance parameters: size of the target, gravity, IMU intrinsics, and scale of a pose sensor. `inputs.rig` holds
-    default priors if the user's rig file states none. The shape of a target is no nuisance parameter here."""
+    """Priors on nuisance parameters: size of the target, gravity, IMU intrinsics, and scale of a pose sensor.
+    `inputs.rig` holds default priors if the user's rig file states none. The shape of a target is no nuisance parameter
+    here."""
     rig, one, priors = inputs.rig, np.ones(1), []
     of_scene = {
         SIZE: (one, rig.target.size_sigma * one),

@@ -13,7 +13,7 @@ from icalib.base.yaml_nodes import YamlValue, parse_yaml, read_yaml
 from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.rig.complete import lack_of
 from icalib.rig.file.targets import target_of, target_or_targets
-from icalib.rig.gravity import Gravity, gravity_to_plain, parse_gravity
+from icalib.rig.gravity import ANYWHERE, Gravity, gravity_to_plain, parse_gravity
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.rig.rig import Rig, by_name
 from icalib.rig.settings import Settings
@@ -33,11 +33,12 @@ def rig_from_dict(plain: dict[str, Any], source: str) -> Rig:
 
 def _rig(root: YamlValue) -> Rig:
     fields = root.record(("sensors",), ("target", "targets", "gravity", "settings", "body"))
-    g = parse_gravity(fields["gravity"]) if "gravity" in fields else None
+    g = parse_gravity(fields["gravity"]) if "gravity" in fields else ANYWHERE
     rig = Rig(
         by_name(*(_sensor(name, value) for name, value in fields["sensors"].entries().items())),
         target_or_targets(root) if "target" in fields or "targets" in fields else NoTarget(),
-        **({"gravity": g.value, "gravity_sigma": g.sigma} if g else {}),
+        gravity=g.value,
+        gravity_sigma=g.sigma,
         settings=_settings(fields["settings"]) if "settings" in fields else Settings(),
         body=fields["body"].text() if "body" in fields else "",
     )

@@ -194,8 +194,9 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
     times, images = instants(stream, state.values), [part.rows[camera.name] for part in at.parts]
     keyframe = keyframes_of(scheme, state, times, images, imu)
     used = are_used(imu, times, state.seconds[keyframe], rig.settings.max_gap_s)
+    gravity = 0.0 if at.motion is None else at.motion.gravity  # no effect without an IMU
     factor = CornerFactor(
-        stream, camera_model(camera.model), imu, 0.0 if at.motion is None else at.motion.gravity, scheme, stream.seconds, keyframe,
+        stream, camera_model(camera.model), imu, gravity, scheme, stream.seconds, keyframe,
         noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
         len(state.seconds), tuple(recording_images.start for recording_images in images[1:]),
     )  # fmt: skip

@@ -148,8 +148,8 @@ _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
 class ImuSensor(Sensor):
     """An IMU.
 
-    Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame. sampling:
-    `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
+    Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
+    sampling: `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
     assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
     `motion.imu_model`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
     prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU.

@@ -9,8 +9,9 @@ import numpy as np
 from icalib.errors import RecordingError
 from icalib.tools.simulation.scenario.robot import Drive
 from icalib.tools.simulation.scenario.room import Room
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.ground import ground_motion
-from icalib.tools.simulation.sensors.motion import AnalyticTrajectory, Reference, Waves, basis_with_z
+from icalib.tools.simulation.sensors.motion import Reference, Waves, basis_with_z
 from icalib.tools.simulation.sensors.recorded import recorded_motion
 
 _HEIGHT = 0.45  # height of the middle of a free motion, relative to the room's
@@ -25,7 +26,7 @@ _GROUND_BELOW_IMU = np.array([0.0, 0.0, -0.3])  # m, origin of the wheel frame i
 
 def drive_motion(
     drive: Drive, room: Room, T_imu_wheel: np.ndarray | None, duration_s: float, rng: np.random.Generator
-) -> AnalyticTrajectory:
+) -> TrueTrajectory:
     """The trajectory of `drive`, with phases drawn from `rng`. T_imu_wheel (4, 4): pose of the wheel frame, None for a
     frame 0.3 m below the IMU.
 
@@ -46,7 +47,7 @@ def drive_motion(
     return Reference(basis, basis.T, center, np.eye(3), turns, shifts)
 
 
-def _within(room: Room, motion: AnalyticTrajectory, path: Path, duration_s: float) -> AnalyticTrajectory:
+def _within(room: Room, motion: TrueTrajectory, path: Path, duration_s: float) -> TrueTrajectory:
     _, position, _ = motion.pose_at(np.arange(0.0, duration_s, _CHECK_S))
     x, y, z = room.size
     if (position < [-0.5 * x, -0.5 * y, 0.0]).any() or (position > [0.5 * x, 0.5 * y, z]).any():

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.tools.simulation.scenario.scenario import Interval, Scenario
-from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.motion import skew
 
 _QUADRATURE_NODES = 6  # a motion below the Nyquist frequency is averaged to rounding
@@ -40,12 +40,12 @@ def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
     return np.round(seconds * 1e9).astype(np.int64)
 
 
-def ideal_readings(scenario: Scenario, trajectory: AnalyticTrajectory, seconds: np.ndarray) -> np.ndarray:
+def ideal_readings(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
     """(N, 6) readings without errors at seconds (N,): angular rates [rad/s] and specific forces [m/s^2], sampled as
     `Scenario.imu_sampling` says.
 
-    Means are those over the time since the reading before; the first one's over a period. The low-pass filter is Gaussian
-    and has no delay. Its amplitude is 1/sqrt(2) at half the rate.
+    Means are those over the time since the reading before; the first one's over a period. The low-pass filter is
+    Gaussian and has no delay. Its amplitude is 1/sqrt(2) at half the rate.
     """
     period = 1.0 / scenario.imu_rate_hz
     if scenario.imu_sampling == "instantaneous":

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario
-from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory
 
 _ANGLES_RAD = np.array([[0.45, 0.22, 0.18], [0.12, 0.09, 0.08]])  # slow, fast sinusoid; about camera z, y, x
 _YAW_RAD = np.array([[0.25, 0.0, 0.0], [0.10, 0.0, 0.0]])

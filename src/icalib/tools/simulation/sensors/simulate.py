@@ -14,7 +14,7 @@ from icalib.geometry.targets.base import BOARD
 from icalib.sensors.sensor import mounted
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, HandheldMotion, Scenario, SimCamera
 from icalib.tools.simulation.scenario.sensor import Report, SimScene, SimSensor
-from icalib.tools.simulation.scenario.trajectory import AnalyticTrajectory, TrueTrajectory
+from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
 from icalib.tools.simulation.sensors.corners import CornerTruth, see_corners
 from icalib.tools.simulation.sensors.drives import drive_motion
 from icalib.tools.simulation.sensors.imu import ideal_readings, imu_stamps, inside, read_imu
@@ -122,7 +122,7 @@ def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, 
     return mounted(T[:3, :3], T[:3, 3], offset) | sensor.values()
 
 
-def _motion(scenario: Scenario, seed: int) -> AnalyticTrajectory:
+def _motion(scenario: Scenario, seed: int) -> TrueTrajectory:
     """The true trajectory."""
     motion = scenario.motion
     rng = np.random.default_rng([seed if motion.seed is None else motion.seed, 0])
