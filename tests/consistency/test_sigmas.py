@@ -16,13 +16,17 @@ def program(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
     return benchmark_program("nees")
 
 
-@pytest.mark.parametrize("name", ["board", "tracks", "drive", "poses"])
+NAMES = ["board", "tracks", "drive", "poses", "imu at 100 Hz", "imu at 200 Hz", "imu at 400 Hz", "imu at 1000 Hz"]
+MOST_BIAS = 4.5  # standard deviations of a mean; an honest component exceeds it once in 150 000
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_errors_are_as_large_as_their_standard_deviations(program: ModuleType, name: str):
     """The bounds hold every honest round but one in a thousand; `python benchmarks/nees.py` draws other seeds."""
     found = program.judge(program.CASES[name](), FIRST_SEED)
     assert found[0].dof >= program.LEAST_DOF
-    assert [str(kind) for kind in found if not kind.consistent] == []
+    assert [str(kind) for kind in found if not kind.consistent or kind.bias > MOST_BIAS] == []
 
 
 def test_all_cases_are_tested(program: ModuleType):
-    assert list(program.CASES) == ["board", "tracks", "drive", "poses"]
+    assert list(program.CASES) == NAMES
