@@ -44,7 +44,8 @@ class ImuData:
     sampling: `instantaneous` readings are samples at their stamps; an `interval-mean` is that of the interval which
     ends at its stamp. variance (N - 1, 3): squared noise densities of each interval: gyroscope, accelerometer, and
     deviation of the specific force from its mean within the interval. walk (2,): squared densities of the bias random
-    walks. gaps: (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where nothing is known.
+    walks. gaps: (start, end) of intervals without readings. seams: (end, begin) between joined recordings, where
+    nothing is known.
     forwards: True if biases of a keyframe apply until the next one, so that motion is propagated forwards only. This is
     so if the readings are an assumption on the motion, whose biases change much between keyframes.
 
