@@ -43,7 +43,7 @@ IMU_EFFECTS = {
     "accelerometer misalignment": [1, 3, 4],
     "gyroscope scale": [6, 8, 11],
     "gyroscope misalignment": [7, 9, 10],
-    "gyroscope rotation": [12, 13, 14],
+    "accelerometer rotation": [12, 13, 14],
     "g-sensitivity": list(range(15, 24)),
 }
 SIZE, SCALE, NONE = "target size", "scale of poses", "none"

@@ -29,7 +29,7 @@ def program(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
         ("camera + IMU", "accelerometer scale"),
         ("camera + IMU", "accelerometer misalignment"),
         ("camera + IMU", "gyroscope scale"),
-        ("camera + IMU", "gyroscope rotation"),
+        ("camera + IMU", "accelerometer rotation"),
         ("camera + IMU", "target size"),
         ("poses + IMU", "gyroscope misalignment"),
         ("poses + IMU", "g-sensitivity"),
@@ -45,7 +45,7 @@ def test_effects_of_two_sigma_are_within_four_printed_ones(program: ModuleType, 
 def test_taken_for_ideal_such_an_imu_is_far_off(program: ModuleType):
     """Or the test above could not fail."""
     kind = program.KINDS["camera + IMU"]
-    scenario = program.with_effect(kind.scenario(), "gyroscope rotation", 2.0, 0)
+    scenario = program.with_effect(kind.scenario(), "accelerometer rotation", 2.0, 0)
     simulation = simulate(scenario, 0)
     rig = rig_for(scenario, intrinsics="free", distortion="free", imu_intrinsics=Parameter("fixed"))
     found = calibrate_measurements(rig, simulation.measurements)

@@ -14,12 +14,12 @@ RATE, FORCE = np.array([0.7, -1.1, 0.4]), np.array([2.0, -3.0, 9.0])
 
 
 def model(intrinsics, rate, force):
-    """Readings without bias and noise, as Kalibr writes the model."""
+    """Readings without bias and noise."""
     M_a, M_g = np.eye(3), np.eye(3)
     M_a[LOWER] += intrinsics[:6]
     M_g[LOWER] += intrinsics[6:12]
     C, A = Rotation.from_rotvec(intrinsics[12:15]).as_matrix(), intrinsics[15:].reshape(3, 3)
-    return M_g @ C @ rate + A @ force, M_a @ force
+    return M_g @ rate + A @ force, M_a @ C @ force
 
 
 def corrected(intrinsics, gyro, accel):

@@ -79,9 +79,9 @@ def corrected(gyro, accel, bias, intrinsics):
     M_a[LOWER] += intrinsics[:6]
     M_g[LOWER] += intrinsics[6:12]
     C = Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
-    f = np.linalg.solve(M_a, (accel - bias[3:]).T).T
+    f = np.linalg.solve(M_a @ C, (accel - bias[3:]).T).T
     gyro = gyro - bias[:3] - f @ intrinsics[15:].reshape(3, 3).T
-    return np.linalg.solve(M_g @ C, gyro.T).T, f
+    return np.linalg.solve(M_g, gyro.T).T, f
 
 
 def generator(w, f):

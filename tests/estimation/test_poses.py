@@ -242,16 +242,16 @@ LOWER = ([0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2])
 
 
 def corrected_force(intrinsics, readings):
-    M_a = np.eye(3)
+    M_a, C = np.eye(3), Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
     M_a[LOWER] += intrinsics[:6]
-    return np.linalg.solve(M_a, readings[:, 3:].T).T
+    return np.linalg.solve(M_a @ C, readings[:, 3:].T).T
 
 
 def corrected_rate(intrinsics, readings):
-    M_g, C = np.eye(3), Rotation.from_rotvec(intrinsics[12:15]).as_matrix()
+    M_g = np.eye(3)
     M_g[LOWER] += intrinsics[6:12]
     sensed = corrected_force(intrinsics, readings) @ intrinsics[15:].reshape(3, 3).T
-    return np.linalg.solve(M_g @ C, (readings[:, :3] - sensed).T).T
+    return np.linalg.solve(M_g, (readings[:, :3] - sensed).T).T
 
 
 @pytest.mark.parametrize("scheme", SCHEMES)

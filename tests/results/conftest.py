@@ -27,10 +27,10 @@ from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Setti
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.camera.record import CornerResiduals
 from icalib.sensors.imu.record import ImuResiduals
+from icalib.sensors.imu.spec import INTRINSICS_LABELS
 from icalib.sensors.lidar.record import LidarResiduals
 
 N_KEYFRAMES, CORNERS_PER_IMAGE = 300, 34
-IMU_LABELS = tuple(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz"))
 POSES = {
     "cam0": ([0.35, 1.47, 89.15], [-0.02164, -0.06468, 0.00981]),
     "cam1": ([-1.05, 1.45, 89.27], [-0.01984, 0.04537, 0.00786]),
@@ -129,7 +129,15 @@ def _groups() -> tuple[ParameterGroup, ...]:
     groups.append(_group(groups, "board0", "tilt", Rotation.from_euler("x", 88.0, degrees=True).as_matrix(), False))
     groups.append(
         ParameterGroup(
-            "imu0", "intrinsics", IMU_LABELS, "", np.zeros(6), np.zeros(6), np.zeros(6), ("fixed",) * 6, "fixed"
+            "imu0",
+            "intrinsics",
+            INTRINSICS_LABELS,
+            "",
+            np.zeros(24),
+            np.zeros(24),
+            np.zeros(24),
+            ("fixed",) * 24,
+            "fixed",
         )
     )
     return tuple(groups)

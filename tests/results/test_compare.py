@@ -193,6 +193,21 @@ def test_kalibr_files(robot: Calibration, tmp_path: Path):
     assert not moved.same and only(moved, "cam1", "translation", "imu0").size == pytest.approx(10.0)
 
 
+def test_kalibrs_imu_frame_is_turned_to_the_gyroscope(robot: Calibration, tmp_path: Path):
+    """Kalibr's poses are in the axes of the accelerometer, which its imu file beside the camchain turns."""
+    intrinsics, turn = robot.group("imu0", "intrinsics"), np.array([0.01, -0.02, 0.015])
+    value = np.concatenate([np.zeros(12), turn, np.zeros(9)])
+    groups = tuple(dataclasses.replace(g, value=value) if g is intrinsics else g for g in robot.groups)
+    robot = dataclasses.replace(robot, groups=groups)
+    robot.save(tmp_path / "out")
+    for name, text in export(robot, "kalibr").files.items():
+        (tmp_path / name).write_text(text)
+    assert compare_files(tmp_path / "out", tmp_path / "camchain-imucam.yaml").same
+    (tmp_path / "imu.yaml").unlink()
+    found = compare_files(tmp_path / "out", tmp_path / "camchain-imucam.yaml")
+    assert only(found, "cam1", "rotation", "imu0").size == pytest.approx(np.rad2deg(np.linalg.norm(turn)))
+
+
 def test_cameras_alone_are_seen_from_each_other(robot: Calibration, tmp_path: Path):
     """Kalibr's camchain without an IMU: a chain of T_cn_cnm1, here of three cameras."""
     robot.save(tmp_path / "out")

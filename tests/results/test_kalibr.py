@@ -156,19 +156,29 @@ def test_imu_that_is_taken_for_ideal(calibration: Calibration):
 
 
 @pytest.mark.parametrize("mode", ["prior", "fixed"])
-def test_imu_intrinsics_give_the_readings_of_kalibrs_model(calibration: Calibration, mode: str):
+def test_imu_intrinsics_and_poses_are_those_of_kalibrs_frame(calibration: Calibration, mode: str):
+    """Kalibr's model predicts the same readings, and its poses the same points."""
     x = np.random.default_rng(3).normal(scale=0.05, size=24)
-    imu = yaml.safe_load(imu_yaml(with_intrinsics(calibration, x, mode)))["imu0"]
+    c = with_intrinsics(calibration, x, mode)
+    imu, chain = yaml.safe_load(imu_yaml(c))["imu0"], yaml.safe_load(camchain(c))
     assert imu["model"] == "scale-misalignment"
-    rate, force = np.array([0.3, -0.7, 1.1]), np.array([1.0, 2.0, -9.0])
-    gyro = imu["gyroscopes"]
+    rate, force = np.array([0.3, -0.7, 1.1]), np.array([1.0, 2.0, -9.0])  # in the axes of the gyroscope
+    to_accel = Rotation.from_rotvec(x[12:15]).as_matrix()
+    w, f, gyro = to_accel @ rate, to_accel @ force, imu["gyroscopes"]
     C = np.array(gyro["C_gyro_i"])
-    reading = gyro["M"] @ C @ rate + gyro["A"] @ C @ force  # Kalibr, IccSensors.py
+    reading = gyro["M"] @ C @ w + gyro["A"] @ C @ f  # Kalibr, IccSensors.py
     F, G, H = correction_matrices(x)
-    accel = imu["accelerometers"]["M"] @ force
+    accel = imu["accelerometers"]["M"] @ f
     np.testing.assert_allclose(F @ accel, force, atol=1e-12)
     np.testing.assert_allclose(G @ reading + H @ accel, rate, atol=1e-12)
-    np.testing.assert_allclose(C, Rotation.from_rotvec(x[12:15]).as_matrix(), atol=1e-15)
+    for name, fields in chain.items():
+        point = np.array([0.2, -0.1, 0.7])
+        T_imu_cam, T_cam_kalibr = c.T_imu_sensor(name), np.array(fields["T_cam_imu"])
+        in_imu = T_imu_cam[:3, :3] @ point + T_imu_cam[:3, 3]
+        np.testing.assert_allclose(T_cam_kalibr[:3, :3] @ to_accel @ in_imu + T_cam_kalibr[:3, 3], point, atol=1e-12)
+    np.testing.assert_allclose(
+        chain["cam1"]["T_cn_cnm1"], chain["cam1"]["T_cam_imu"] @ np.linalg.inv(chain["cam0"]["T_cam_imu"]), atol=1e-12
+    )
 
 
 def test_unknown_rate_is_said(calibration: Calibration):

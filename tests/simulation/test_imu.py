@@ -56,8 +56,8 @@ def test_intrinsics_follow_the_scale_misalignment_model():
     for w, f, gyro, accel in zip(
         not_none(ideal).gyro, not_none(ideal).accel, not_none(real).gyro, not_none(real).accel, strict=True
     ):
-        np.testing.assert_allclose(gyro, M_g @ C @ w + A @ f, atol=1e-13)
-        np.testing.assert_allclose(accel, M_a @ f, atol=1e-13)
+        np.testing.assert_allclose(gyro, M_g @ w + A @ f, atol=1e-13)
+        np.testing.assert_allclose(accel, M_a @ C @ f, atol=1e-13)
 
 
 def test_gap_loses_readings_and_keeps_the_motion():

@@ -300,7 +300,7 @@ def test_a_lidar_of_too_many_points(tmp_path):
 
 
 EFFECTS = """effects:
-  imu: {accel_scale: [0.01, 0.02, 0.03], gyro_misalignment: [0.04, 0.05, 0.06], gyro_rotation: [0.07, 0.08, 0.09]}
+  imu: {accel_scale: [0.01, 0.02, 0.03], gyro_misalignment: [0.04, 0.05, 0.06], accel_rotation: [0.07, 0.08, 0.09]}
   pose_scale: {mocap: 0.99}
   target_size: 1.01
 """

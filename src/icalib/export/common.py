@@ -154,10 +154,15 @@ def sensor_intrinsics(c: Calibration) -> list[str]:
     return phrases
 
 
+def imu_values(c: Calibration) -> np.ndarray:
+    """(24,) IMU intrinsics (see `motion.imu_model`), zeros without any."""
+    group = None if c.imu is None else c.group_or_none(c.imu, "intrinsics")
+    return np.zeros(24) if group is None else group.value
+
+
 def imu_intrinsics(c: Calibration) -> list[str]:
     """Words for scale and misalignment of the IMU, if any value is nonzero."""
-    nonzero = any((g.sensor, g.name) == (c.imu, "intrinsics") and g.value.any() for g in c.groups)
-    return [f"scale and misalignment of {c.imu}"] if nonzero else []
+    return [f"scale and misalignment of {c.imu}"] if imu_values(c).any() else []
 
 
 def topic(c: Calibration, name: str, default: str) -> str:

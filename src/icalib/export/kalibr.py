@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.export.common import inverse, restarts, time_offset
+from icalib.export.common import imu_values, inverse, restarts, time_offset
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
@@ -55,7 +55,8 @@ def camchain(calibration: Calibration) -> str:
     else:
         comment += (
             "T_cam_imu takes coordinates in the imu frame to the camera frame, T_cn_cnm1 those of the camera before to "
-            "this one; t_imu = t_cam + timeshift_cam_imu [s]."
+            "this one; t_imu = t_cam + timeshift_cam_imu [s]. The imu frame has the axes of the accelerometer, as "
+            "Kalibr's; calibration.yaml has those of the gyroscope."
         )
     fits = [sentence for i in range(len(c.cameras)) if (sentence := _lens(c, i)[1])]
     restarting = [
@@ -92,10 +93,18 @@ def imu_yaml(calibration: Calibration) -> str:
     return _text([comment, *_renamed("imu", (c.imu,))], {"imu0": data | _intrinsics(c)})
 
 
+def _T_imu_kalibr(c: Calibration) -> np.ndarray:
+    """(4, 4) pose of Kalibr's IMU frame, which has the axes of the accelerometer, in icalib's, which has those of the
+    gyroscope."""
+    T = np.eye(4)
+    T[:3, :3] = so3.exp(-imu_values(c)[12:15])
+    return T
+
+
 def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
     T_cam_imu = inverse(c.T_imu_sensor(name))
-    data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": T_cam_imu.tolist()}
+    data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": (T_cam_imu @ _T_imu_kalibr(c)).tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
     lens, _ = _lens(c, index)
@@ -139,22 +148,18 @@ def _lens_fields(model: str, params: np.ndarray) -> dict[str, Any]:
 
 
 def _intrinsics(c: Calibration) -> dict[str, Any]:
-    """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f; empty if the IMU is assumed ideal.
-
-    icalib's g-sensitivity applies to f in the axes of the accelerometer (motion.imu_model), so A = A_icalib C_gyro_i^T.
-    """
-    groups = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics")]
-    if not groups or (groups[0].mode == "fixed" and not groups[0].value.any()):
+    """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, of w and f in the axes of the
+    accelerometer; empty if the IMU is assumed ideal."""
+    x = imu_values(c)
+    if not x.any():
         return {}
-    x = groups[0].value
-    C = so3.exp(x[12:15])
     return {
         "model": "scale-misalignment",
         "accelerometers": {"M": lower(x[:6]).tolist()},
         "gyroscopes": {
             "M": lower(x[6:12]).tolist(),
-            "A": (x[15:].reshape(3, 3) @ C.T).tolist(),
-            "C_gyro_i": C.tolist(),
+            "A": x[15:].reshape(3, 3).tolist(),
+            "C_gyro_i": _T_imu_kalibr(c)[:3, :3].tolist(),
         },
     }
 

@@ -10,6 +10,7 @@ from icalib.errors import CalibrationError
 from icalib.export.common import (
     Export,
     guesses,
+    imu_values,
     inverse,
     lens_of,
     need,
@@ -78,10 +79,8 @@ def _offsets(c: Calibration) -> tuple[str, ...]:
 
 def _imu(c: Calibration, imu: str) -> str:
     """File of the IMU. w: rate, f: specific force, both in the imu frame; gyro = Tw R_IMUtoGYRO w + Tg f, accel = Ta
-    R_IMUtoACC f."""
-    noise, x = c.rig["sensors"][imu]["noise"], np.zeros(24)
-    intrinsics = [g.value for g in c.groups if (g.sensor, g.name) == (imu, "intrinsics") and len(g.value) == 24]
-    x = intrinsics[0] if intrinsics else x
+    R_IMUtoACC f. Its model "kalibr" reads Tw and Ta as lower triangular, and uses both rotations."""
+    noise, x = c.rig["sensors"][imu]["noise"], imu_values(c)
     data = {
         "T_i_b": np.eye(4).tolist(),
         "accelerometer_noise_density": float(noise["accel"]),
@@ -93,13 +92,14 @@ def _imu(c: Calibration, imu: str) -> str:
         "update_rate": float(c.rates[imu]),
         "model": "kalibr",
         "Tw": lower(x[6:12]).tolist(),
-        "R_IMUtoGYRO": so3.exp(x[12:15]).tolist(),
+        "R_IMUtoGYRO": np.eye(3).tolist(),
         "Ta": lower(x[:6]).tolist(),
-        "R_IMUtoACC": np.eye(3).tolist(),
+        "R_IMUtoACC": so3.exp(x[12:15]).tolist(),
         "Tg": x[15:].reshape(3, 3).tolist(),
     }
     comments = [
-        f"{imu} for OpenVINS, by icalib. The imu frame is the body frame. Densities are in continuous time, SI.",
+        f"{imu} for OpenVINS, by icalib. The imu frame, with the axes of the gyroscope, is the body frame.",
+        "Densities are in continuous time, SI.",
         "gyro = Tw R_IMUtoGYRO rate + Tg force, accel = Ta R_IMUtoACC force, of rate and force in the imu frame.",
     ]
     return yaml_text(comments, {"imu0": data}, HEAD)

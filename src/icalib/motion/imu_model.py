@@ -1,7 +1,11 @@
-"""Kalibr's scale-misalignment model of IMU readings.
+"""Scale-misalignment model of IMU readings, in the axes of the gyroscope.
 
-    gyro  = M_g C w + A_g f + b_g + noise        f: specific force, w: angular rate, both in the IMU frame
-    accel = M_a f + b_a + noise                  M: lower triangular, C = Exp(r): accelerometer to gyroscope axes
+    gyro  = M_g w + A_g f + b_g + noise      w: angular rate, f: specific force, both in the IMU frame
+    accel = M_a C f + b_a + noise            M: lower triangular, C = Exp(r): gyroscope to accelerometer axes
+
+The IMU frame has its origin at the accelerometer and the axes of the gyroscope. Its x axis is the one that the
+gyroscope's x axis measures, because M_g is lower triangular. Kalibr's frame has the axes of the accelerometer instead,
+rotated by C.
 
 Intrinsics are 24 numbers (`INTRINSICS_LABELS` of `sensors.imu.spec`), zero for an ideal IMU: M_a - I (xx yx yy zx zy
 zz), M_g - I (same), r (3), A_g (row-major 9).
@@ -48,9 +52,7 @@ def correction_matrices(intrinsics):
     for n in range(6):
         ma[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[n]
         mg[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[6 + n]
-    F = _lower_inverse(ma)
-    C = so3.exp(intrinsics[12:15])
-    G = tmul3(C, _lower_inverse(mg))
+    F, G = tmul3(so3.exp(intrinsics[12:15]), _lower_inverse(ma)), _lower_inverse(mg)
     H = mul3(mul3(G, sensitivity(intrinsics)), F)
     for i in range(3):
         for j in range(3):

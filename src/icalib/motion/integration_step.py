@@ -278,30 +278,25 @@ def _add_biases(run):
 def fill_intrinsics(rate, force, by, run):
     """Fills the derivatives of corrected rate (three rows) and force (three rows) by the 24 IMU intrinsics, from
     run[AT_INTRINSICS] on, see `imu_model`. Elements that are always zero stay zero."""
-    u, turn = times(matrix(by, ROW_C), rate), _cross_product(rate, matrix(by, ROW_JR))
-    f, lower = force, (force[0], force[0], force[1], force[0], force[1], force[2])
+    u, turn = times(matrix(by, ROW_C), force), _cross_product(force, matrix(by, ROW_JR))
+    f, w = force, rate
     for i in range(3):
         F0, F1, F2 = by[ROW_F, 3 * i], by[ROW_F, 3 * i + 1], by[ROW_F, 3 * i + 2]
         o = AT_INTRINSICS + J_STRIDE * (3 + i)
-        run[o], run[o + 1], run[o + 2] = -F0 * lower[0], -F1 * lower[1], -F1 * lower[2]
-        run[o + 3], run[o + 4], run[o + 5] = -F2 * lower[3], -F2 * lower[4], -F2 * lower[5]
+        run[o], run[o + 1], run[o + 2] = -F0 * u[0], -F1 * u[0], -F1 * u[1]
+        run[o + 3], run[o + 4], run[o + 5] = -F2 * u[0], -F2 * u[1], -F2 * u[2]
+        run[o + 12], run[o + 13], run[o + 14] = turn[3 * i], turn[3 * i + 1], turn[3 * i + 2]
     for i in range(3):
         S0, S1, S2 = by[ROW_GA, 3 * i], by[ROW_GA, 3 * i + 1], by[ROW_GA, 3 * i + 2]
         G0, G1, G2 = by[ROW_G, 3 * i], by[ROW_G, 3 * i + 1], by[ROW_G, 3 * i + 2]
         o, q = AT_INTRINSICS + J_STRIDE * i, AT_INTRINSICS + J_STRIDE * 3
-        for n in range(6):
+        for n in range(15):
             run[o + n] = -(S0 * run[q + n] + S1 * run[q + J_STRIDE + n] + S2 * run[q + 2 * J_STRIDE + n])
-        run[o + 6], run[o + 7], run[o + 8] = -G0 * u[0], -G1 * u[0], -G1 * u[1]
-        run[o + 9], run[o + 10], run[o + 11] = -G2 * u[0], -G2 * u[1], -G2 * u[2]
+        run[o + 6], run[o + 7], run[o + 8] = -G0 * w[0], -G1 * w[0], -G1 * w[1]
+        run[o + 9], run[o + 10], run[o + 11] = -G2 * w[0], -G2 * w[1], -G2 * w[2]
         run[o + 15], run[o + 16], run[o + 17] = -G0 * f[0], -G0 * f[1], -G0 * f[2]
         run[o + 18], run[o + 19], run[o + 20] = -G1 * f[0], -G1 * f[1], -G1 * f[2]
         run[o + 21], run[o + 22], run[o + 23] = -G2 * f[0], -G2 * f[1], -G2 * f[2]
-    for k in range(3):
-        (
-            run[AT_INTRINSICS + 12 + k],
-            run[AT_INTRINSICS + J_STRIDE + 12 + k],
-            run[AT_INTRINSICS + 2 * J_STRIDE + 12 + k],
-        ) = turn[k], turn[3 + k], turn[6 + k]
 
 
 @njit(cache=True, nogil=True)
@@ -316,7 +311,7 @@ def _add_intrinsics(run):
     for i in range(3, 9):
         o, d = J_STRIDE * i + 6, AT_STEP + STEP_STRIDE * i + 3
         a, b, c = run[d], run[d + 1], run[d + 2]
-        for j in range(6):  # those of the accelerometer
+        for j in range(15):  # those of the accelerometer, and its rotation
             x = run[AT_J + o + j] + a * run[AT_INTRINSICS + 3 * J_STRIDE + j]
             run[AT_J + o + j] = (
                 x + b * run[AT_INTRINSICS + 4 * J_STRIDE + j] + c * run[AT_INTRINSICS + 5 * J_STRIDE + j]

@@ -58,7 +58,7 @@ def _intrinsics_words(imu: ImuSensor) -> str:
     sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
     name = class_of_sigma(imu.intrinsics.sigma)
     whose = "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
-    turn = np.rad2deg(sigma["gyro_rotation_x"])
+    turn = np.rad2deg(sigma["accel_rotation_x"])
     return (
         f"prior of IMU intrinsics {whose}: scale {100.0 * sigma['accel_xx']:.2g} % (accelerometer), "
         f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations)."

@@ -40,8 +40,8 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Standard deviations of the parameters of Kalibr's scale-misalignment model (`motion.imu_model`) about the
-    ideal IMU. Scales are relative; misalignments of an axis and the rotation between gyroscope and accelerometer are in
+    """Standard deviations of the parameters of the scale-misalignment model (`motion.imu_model`) about the ideal
+    IMU. Scales are relative; misalignments of an axis and the rotation between gyroscope and accelerometer are in
     rad; g-sensitivity is in rad/s per m/s^2."""
 
     accel_scale: float
@@ -64,7 +64,7 @@ DEFAULT_CLASS = "consumer"
 INTRINSICS_LABELS = (
     *(f"accel_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
     *(f"gyro_{n}" for n in ("xx", "yx", "yy", "zx", "zy", "zz")),
-    *(f"gyro_rotation_{n}" for n in "xyz"),
+    *(f"accel_rotation_{n}" for n in "xyz"),
     *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
 )
 N_INTRINSICS = len(INTRINSICS_LABELS)

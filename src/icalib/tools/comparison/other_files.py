@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.yaml_nodes import YamlValue
+from icalib.base.yaml_nodes import YamlValue, read_yaml
 from icalib.errors import CalibrationError
 from icalib.export.urdf_tree import read_urdf
 from icalib.sensors.sensor import TIME_OFFSET
@@ -38,9 +38,9 @@ def side_of_kalibr(root: YamlValue) -> Side:
     imus = {n: v.entries() for n, v in parts.items() if _KALIBR_NOISE["gyro"] in v.entries()}
     has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(fields) for fields in cameras.values())
     body = next(iter(imus), "imu") if has_imu else next(iter(cameras))
-    poses = {body: np.eye(4)}
+    poses, T_gyro_imu = {body: np.eye(4)}, _T_gyro_imu(Path(root.file))
     for i, (name, fields) in enumerate(cameras.items()):
-        poses[name] = _camera_pose(root, name, fields, poses, list(cameras)[i - 1] if i else None)
+        poses[name] = _camera_pose(T_gyro_imu, name, fields, poses, list(cameras)[i - 1] if i else None)
     quantities: dict[tuple[str, str], Quantity] = {}
     for name, fields in cameras.items():
         if "timeshift_cam_imu" in fields:
@@ -53,13 +53,26 @@ def side_of_kalibr(root: YamlValue) -> Side:
     return Side(root.file, "Kalibr file", body, has_imu, poses, quantities=quantities, lenses=lenses)
 
 
+def _T_gyro_imu(chain: Path) -> np.ndarray:
+    """(4, 4) rotation from Kalibr's IMU frame, which has the axes of the accelerometer, to the axes of the gyroscope.
+    It is that of the imu file that Kalibr writes beside `chain`; without one the identity."""
+    beside, T = chain.with_name(chain.name.replace("camchain-imucam", "imu")), np.eye(4)
+    if beside != chain and beside.is_file():
+        entries = read_yaml(beside, "Kalibr file").entries()
+        imu = entries["imu0"].entries() if "imu0" in entries else entries
+        gyroscope = imu["gyroscopes"].entries() if "gyroscopes" in imu else {}
+        if "C_gyro_i" in gyroscope:
+            T[:3, :3] = _matrix(gyroscope["C_gyro_i"], 3, "a rotation")
+    return T
+
+
 def _camera_pose(
-    root: YamlValue, name: str, fields: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
+    T_gyro_imu: np.ndarray, name: str, fields: dict[str, YamlValue], poses: dict[str, np.ndarray], before: str | None
 ) -> np.ndarray:
     """(4, 4) T_body_cam: from T_cam_imu, or its inverse T_imu_cam (OpenVINS), or along the chain of cameras; else
     NaN. before: name of the previous camera of the chain."""
     if "T_cam_imu" in fields:
-        return np.linalg.inv(_transform(fields["T_cam_imu"]))
+        return T_gyro_imu @ np.linalg.inv(_transform(fields["T_cam_imu"]))
     if "T_imu_cam" in fields:
         return _transform(fields["T_imu_cam"])
     if before is not None and "T_cn_cnm1" in fields:
@@ -68,15 +81,21 @@ def _camera_pose(
 
 
 def _transform(value: YamlValue) -> np.ndarray:
+    T = _matrix(value, 4, "a transform")
+    if np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
+        value.fail("is not a transform: its last row must be 0, 0, 0, 1; correct it.")
+    return T
+
+
+def _matrix(value: YamlValue, size: int, what: str) -> np.ndarray:
+    """(size, size) matrix, whose first 3 x 3 entries are rounded digits of a rotation, made orthonormal."""
     rows = value.items()
-    if len(rows) != 4:
-        value.fail(f"a transform has 4 rows of 4 numbers, but this has {len(rows)}; correct it.")
-    T = np.array([row.vector(4) for row in rows])
+    if len(rows) != size:
+        value.fail(f"{what} has {size} rows of {size} numbers, but this has {len(rows)}; correct it.")
+    T = np.array([row.vector(size) for row in rows])
     R = T[:3, :3]
-    if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0 or np.abs(T[3] - [0, 0, 0, 1]).max() > 0:
-        value.fail(
-            "is not a transform: its first 3 x 3 entries must be a rotation, its last row 0, 0, 0, 1; correct it."
-        )
+    if np.abs(R @ R.T - np.eye(3)).max() > _ROUNDING or np.linalg.det(R) < 0:
+        value.fail(f"is not {what}: its first 3 x 3 entries must be a rotation; correct it.")
     u, _, vt = np.linalg.svd(R)
     T[:3, :3] = u @ vt
     return T

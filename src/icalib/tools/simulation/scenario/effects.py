@@ -17,7 +17,7 @@ _IMU = {
     "accel_misalignment": (1, 3, 4),
     "gyro_scale": (6, 8, 11),
     "gyro_misalignment": (7, 9, 10),
-    "gyro_rotation": (12, 13, 14),
+    "accel_rotation": (12, 13, 14),
     "g_sensitivity": tuple(range(15, 24)),
 }
 _LARGEST = 0.2  # limit of a relative error, which no usable sensor exceeds

@@ -128,13 +128,13 @@ class Scenario:
     T_world_bodies (bodies, 4, 4): poses of the bodies of a target with several bodies; T_world_board is then only the
     pose that the motion faces. None: the target is one body, at T_world_board. Bodies do not hide each other.
 
-    imu_intrinsics (24,), Kalibr's scale-misalignment model: w_m = M_g C_g w + A_g f + b_g, a_m = M_a f + b_a, with
-    M_a - I and M_g - I lower triangular (xx, yx, yy, zx, zy, zz), C_g = Exp(rotation vector), A_g row-major; in the
-    order M_a, M_g, C_g, A_g. bow (3,) [m]: a, b, c of the shape z = a x^2 + b x y + c y^2 of a body that bends, with x
-    and y from -1 to 1 over its extent. Corner noise has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, with
-    the RMS image speed of the corners of an image [px/s]. shift_px: sigma of a 2D shift that all corners of an image
-    share. target_size: true over stated length of the target. outlier_fraction: of the corners, which are moved by up
-    to +-outlier_px on each axis.
+    imu_intrinsics (24,), the scale-misalignment model: w_m = M_g w + A_g f + b_g, a_m = M_a C_a f + b_a, with w and f
+    in the axes of the gyroscope, M_a - I and M_g - I lower triangular (xx, yx, yy, zx, zy, zz), C_a = Exp(rotation
+    vector) from gyroscope to accelerometer axes, A_g row-major; in the order M_a, M_g, C_a, A_g. bow (3,) [m]: a, b, c
+    of the shape z = a x^2 + b x y + c y^2 of a body that bends, with x and y from -1 to 1 over its extent. Corner noise
+    has sigma^2 = corner_noise_px^2 + (blur_s * image speed)^2, with the RMS image speed of the corners of an image
+    [px/s]. shift_px: sigma of a 2D shift that all corners of an image share. target_size: true over stated length of
+    the target. outlier_fraction: of the corners, which are moved by up to +-outlier_px on each axis.
 
     Raises RigError if a body has no pose, or if motion, room and sensors are incompatible.
     """

@@ -64,14 +64,14 @@ def ideal_readings(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.n
 
 def distort(intrinsics: np.ndarray, true: np.ndarray) -> np.ndarray:
     """(N, 6) readings without bias and noise of true angular rates [rad/s] and specific forces [m/s^2] (N, 6), by
-    Kalibr's scale-misalignment model. intrinsics (24,): see `Scenario`."""
+    the scale-misalignment model. intrinsics (24,): see `Scenario`."""
     M_a, M_g = np.eye(3), np.eye(3)
     M_a[_LOWER] += intrinsics[:6]
     M_g[_LOWER] += intrinsics[6:12]
-    C_g = rotation_from_vector(intrinsics[12:15])
+    C_a = rotation_from_vector(intrinsics[12:15])
     A_g = intrinsics[15:24].reshape(3, 3)
     rate, force = true[:, :3], true[:, 3:]
-    return np.concatenate([rate @ (M_g @ C_g).T + force @ A_g.T, force @ M_a.T], axis=1)
+    return np.concatenate([rate @ M_g.T + force @ A_g.T, force @ (M_a @ C_a).T], axis=1)
 
 
 def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
