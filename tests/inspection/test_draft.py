@@ -15,6 +15,7 @@ from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig.file import load_rig, load_target
+from icalib.sensors.imu.spec import class_imperfections
 from icalib.tools.inspection.draft import write_draft
 
 SIZE = (32, 24)
@@ -103,7 +104,10 @@ def test_a_draft_loads_once_the_target_is_filled_in(draft, bags):
         "default for a consumer IMU",
     )
     assert 'frame "left: eye"' in text and 'frame "imu_link"' in text
-    assert "ruler" in text and "The default class" in text
+    assert "ruler" in text and "The noise of a class" in text
+    assert "The most valuable line of this draft" in text and "\n    intrinsics: consumer\n" in text
+    sigma = not_none(not_none(rig.imu).intrinsics.sigma)
+    np.testing.assert_array_equal(sigma, class_imperfections("consumer").sigma)
 
 
 def clouds_and_joints(bags):

@@ -18,6 +18,7 @@ from icalib.report import report_html
 from icalib.result import Calibration, load_calibration, relative_pose, verdict
 from icalib.result.quantities import rows
 from icalib.result.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
+from icalib.sensors.imu.spec import class_imperfections
 
 
 def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> Calibration:
@@ -126,6 +127,23 @@ def test_every_component_of_a_bad_verdict_is_in_the_reasons(calibration: Calibra
     direction, rest, uncertain, weak = found.reasons
     assert direction == directions[0] and "cam0 rotation x" not in rest and "cam0 rotation y" in rest
     assert "cam0 translation x" in uncertain and "cam1 time offset" in weak
+
+
+@pytest.mark.parametrize("verdict", ["weak", "undetermined"])
+def test_the_prior_of_the_imu_is_named_before_motion_is_asked_for(calibration: Calibration, verdict: str):
+    """Where it contributes most of the variance: here of cam0, not of cam1."""
+    c, share = with_verdicts(calibration, verdict, ("rotation",)), {"cam0": 0.8, "cam1": 0.6}
+    groups = tuple(
+        dataclasses.replace(g, std_imu=share[g.sensor] * g.std) if g.name == "rotation" else g for g in c.groups
+    )
+    intrinsics = {"prior": [0.0] * 24, "sigma": class_imperfections("consumer").sigma.tolist()}
+    sensors = c.rig["sensors"] | {"imu0": c.rig["sensors"]["imu0"] | {"intrinsics": intrinsics}}
+    first, second = dataclasses.replace(c, groups=groups, rig=c.rig | {"sensors": sensors}).reasons
+    std = np.rad2deg(c.group("cam0", "rotation").std[0])
+    assert first.startswith(f"cam0 rotation x ({0.8 * std:.2g} of {std:.2g} deg), cam0 rotation y")
+    assert "prior on IMU intrinsics of a consumer IMU" in first and "`intrinsics: fixed`" in first
+    assert "record" not in first and "cam1" not in first
+    assert second.startswith("cam1 rotation x (std") and "record longer" in second
 
 
 def test_a_lens_is_judged_by_its_projection(calibration: Calibration):

@@ -74,6 +74,7 @@ class ImuData:
         if self.unit is None:
             return np.zeros(0, dtype=np.int64)
         return layout.columns(*self.unit) if layout.has(*self.unit) else np.full(1, -1)
+
     sampling: Sampling = "instantaneous"
 
     @cached_property

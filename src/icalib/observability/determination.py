@@ -83,13 +83,13 @@ class Determined:
         t = self.estimate.problem.tolerance
         return t[:, None] * scatter(self._known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
 
-    @property
-    def prior_variance(self) -> np.ndarray:
-        """(B,) contribution of the priors on nuisance parameters to the diagonal of the covariance. Information that
-        noise in the Jacobian adds is subtracted first, as in `scatter`."""
+    def prior_variance(self, sensor: str | None = None) -> np.ndarray:
+        """(B,) contribution of the priors on nuisance parameters, of `sensor` or of all, to the diagonal of the
+        covariance. Information that noise in the Jacobian adds is subtracted first, as in `scatter`."""
         problem = self.estimate.problem
         root = problem.tolerance[:, None] * restricted_root(self._known, self.fixed_directions)
-        return variance_of_priors(root @ root.T, nuisance_priors(problem), self.estimate.outcome.state)
+        priors = [p for p in nuisance_priors(problem) if sensor in (None, p.block.sensor)]
+        return variance_of_priors(root @ root.T, priors, self.estimate.outcome.state)
 
     @property
     def _known(self) -> np.ndarray:

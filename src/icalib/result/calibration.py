@@ -46,6 +46,7 @@ class ParameterGroup:
     mode: str  # free, fixed, prior
     columns: tuple[int, ...] | None = None
     factor: np.ndarray | None = None  # (n,) empirical factor, of which only values above 1 scale std_formal
+    std_imu: np.ndarray | None = None  # (n,) part of std that the prior on IMU intrinsics contributes
 
 
 @dataclass(frozen=True)

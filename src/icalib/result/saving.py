@@ -217,7 +217,7 @@ def _tuples(plain: dict[str, Any]) -> dict[str, Any]:
 
 def _group(plain: dict[str, Any]) -> ParameterGroup:
     fields = dict(plain)
-    for name in ("value", "std_formal", "std", "factor"):
+    for name in ("value", "std_formal", "std", "factor", "std_imu"):
         fields[name] = None if plain[name] is None else np.array(plain[name], dtype=np.float64)
     for name in ("labels", "verdict", "columns"):
         fields[name] = None if plain[name] is None else tuple(plain[name])

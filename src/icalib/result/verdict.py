@@ -24,6 +24,7 @@ from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
 from icalib.rig import Settings
 from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
+from icalib.sensors.imu.spec import prior_words
 from icalib.sensors.parameter_spec import display_unit
 
 if TYPE_CHECKING:
@@ -52,6 +53,7 @@ UNUSABLE = WORST_FIRST[:2]  # verdicts on components that must not be used
 TOO_UNCERTAIN = 10.0  # standard deviation in tolerances above which a component must not be used
 NULL_SPACE_SHARE = 0.25  # squared norm of a component's unit vector in the null space; unobservable above it
 MOST_NAMED = 6  # components that one sentence names
+_MOST_BY_IMU = 0.5  # share of a variance from the prior on IMU intrinsics above which a better prior is the advice
 
 
 def usability(c: Calibration) -> Usability:
@@ -140,10 +142,18 @@ def counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
 
 
 def _named(c: Calibration, *verdicts: Verdict) -> Iterator[str]:
-    """A sentence for each of `verdicts` on the components that have it, without those that the sentence on an
-    unobservable direction names."""
+    """Sentences on the components that have each of `verdicts`: first those whose standard deviation comes from the
+    prior on IMU intrinsics, then all others but those that the sentence on an unobservable direction names."""
     for verdict in verdicts:
-        names = [name for name, v in _components(c) if v == verdict]
+        found = [(name, by_imu) for name, v, by_imu in _components(c) if v == verdict]
+        if names := [name for name, by_imu in found if by_imu]:
+            prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
+            yield (
+                f"{_listed(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
+                f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial`, `tactical`), or `intrinsics: "
+                "fixed` if it is calibrated."
+            )
+        names = [name for name, by_imu in found if not by_imu]
         if verdict == "unobservable":
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
@@ -163,18 +173,22 @@ def _more(c: Calibration) -> str:
     return f"record longer, and {f'turn the rig about {axes}' if axes else 'turn about and move along every axis'}"
 
 
-def _components(c: Calibration) -> Iterator[tuple[str, Verdict]]:
-    """Name with standard deviation, and verdict, of every component that contributes to the verdict on the result."""
+def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
+    """Name with standard deviation, verdict, and whether the prior on IMU intrinsics contributes most of the variance,
+    of every component that contributes to the verdict on the result."""
     for g in c.groups:
         verdicts = counted(c, g)
         if g.name in (lens := c.lenses.get(g.sensor, ())):
             if verdicts and g.name == lens[0]:
-                yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0]
+                yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0], False
             continue
         unit, scale = display_unit(g.unit)
-        for label, verdict, std in zip(g.labels, verdicts, g.std.tolist(), strict=False):
-            name = g.name if label in (g.name, "") else f"{g.name} {label}"
-            yield f"{g.sensor} {name.replace('_', ' ')} (std {scale * std:.2g} {unit})".replace(" )", ")"), verdict
+        by_imu = np.zeros(len(g.std)) if g.std_imu is None else g.std_imu
+        for label, verdict, std, part in zip(g.labels, verdicts, g.std.tolist(), by_imu.tolist(), strict=False):
+            name = f"{g.sensor} {g.name if label in (g.name, '') else f'{g.name} {label}'}".replace("_", " ")
+            is_most = part**2 > _MOST_BY_IMU * std**2
+            size = f"{scale * part:.2g} of {scale * std:.2g} {unit}" if is_most else f"std {scale * std:.2g} {unit}"
+            yield f"{name} ({size.strip()})", verdict, is_most
 
 
 def _listed(names: list[str]) -> str:

@@ -177,6 +177,7 @@ def _groups(
     formal, problem = np.sqrt(np.diag(observability.covariance)), determined.estimate.problem
     overall = variances.pooled(calibration_columns(inputs))
     state = determined.estimate.outcome.state
+    by_imu = variances.weight * np.sqrt(np.maximum(determined.prior_variance(inputs.rig.reference), 0.0))
     groups = []
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _is_assumed(inputs, block.sensor):
@@ -190,7 +191,8 @@ def _groups(
         k = block.columns
         std, factor = formal[k], variances.factor(k, overall)
         sizes = factor * np.maximum(observability.spread[k], std / problem.tolerance[k])
-        groups.append(_group(inputs, block, state, std, factor, observability.verdicts(k, sizes)))
+        group = _group(inputs, block, state, std, factor, observability.verdicts(k, sizes))
+        groups.append(dataclasses.replace(group, std_imu=by_imu[k]))
     return tuple(groups)
 
 

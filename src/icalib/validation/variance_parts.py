@@ -35,7 +35,7 @@ class VarianceParts(NamedTuple):
         split."""
         estimate = determined.estimate
         variance, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
-        prior = np.clip(determined.prior_variance, 0.0, variance - guess)
+        prior = np.clip(determined.prior_variance(), 0.0, variance - guess)
         formal = noise_variance(estimate.problem, estimate.outcome)
         empirical = _empirical_variance(estimate, segments, formal)
         ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed

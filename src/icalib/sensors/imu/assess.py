@@ -12,7 +12,7 @@ from icalib.result import SensorFit
 from icalib.result.timeline import Timeline
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.record import ImuResiduals
-from icalib.sensors.imu.spec import INTRINSICS_LABELS, class_of_sigma
+from icalib.sensors.imu.spec import INTRINSICS_LABELS, prior_words
 
 
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
@@ -56,9 +56,7 @@ def _intrinsics_words(imu: ImuSensor) -> str:
     if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
         return ""
     sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
-    name = class_of_sigma(imu.intrinsics.sigma)
-    whose = "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
-    turn = np.rad2deg(sigma["accel_rotation_x"])
+    turn, whose = np.rad2deg(sigma["accel_rotation_x"]), prior_words(imu.intrinsics.sigma)
     return (
         f"prior of IMU intrinsics {whose}: scale {100.0 * sigma['accel_xx']:.2g} % (accelerometer), "
         f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations)."

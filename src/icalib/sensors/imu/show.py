@@ -11,6 +11,7 @@ from icalib.report.sections import Section, plot_place
 from icalib.result import Calibration
 from icalib.sensors.imu.record import ImuResiduals
 
+LEGEND = "the axes of an IMU are those of its gyroscope"
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")  # titles of three columns each
 _WORDS = (
     "Whitened: between two keyframes, in units of what the IMU's noise allows. "

@@ -123,9 +123,10 @@ def class_of_noise(noise: ImuNoise) -> str:
     return "tactical" if is_tactical else DEFAULT_CLASS
 
 
-def class_of_sigma(sigma: np.ndarray) -> str | None:
-    """The class whose imperfections have standard deviations `sigma` (24,), or None."""
-    return next((name for name, prior in _IMPERFECTIONS.items() if np.array_equal(prior.sigma, sigma)), None)
+def prior_words(sigma: np.ndarray) -> str:
+    """Words on whose standard deviations `sigma` (24,) of the intrinsics are: a class, or the rig file."""
+    name = next((name for name, prior in _IMPERFECTIONS.items() if np.array_equal(prior.sigma, sigma)), None)
+    return "from the rig file" if name is None else f"of {'an' if name[0] in 'aeiou' else 'a'} {name} IMU"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from icalib.sensors.imu.inspect.facts import ImuSource
-from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES, TwoSources
+from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES, ImuNoise, TwoSources, class_noise, class_of_noise
 from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kalibr import KalibrImu
 from icalib.tools.inspection.rig_lines import comment, in_frame, name_text, number, place_line
@@ -22,7 +22,12 @@ def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[st
     frame = facts.frame if facts else ""
     yield from (f"  {name}:", "    type: imu")
     yield "    " + place_line(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
-    yield from _noise(_kalibr_imu(inspection, topic.name))
+    kalibr = _kalibr_imu(inspection, topic.name)
+    yield from _noise(kalibr)
+    yield "    # The most valuable line of this draft: how far axes and scales of this IMU may be off. Rotations and"
+    yield f"    # lengths depend on it. One of {', '.join(IMU_CLASSES)}; `fixed` if it is calibrated."
+    noise = class_noise(DEFAULT_CLASS) if kalibr is None else ImuNoise(**kalibr.densities, source="")
+    yield f"    intrinsics: {class_of_noise(noise)}"
     others = [f"{n} ({imu.topic.name})" for n, imu in imus.items() if n != name]
     if others:
         yield f"  # Also recorded: {comment(', '.join(others))}; a rig has one IMU, choose the best."
@@ -30,8 +35,7 @@ def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[st
 
 def _noise(kalibr: KalibrImu | None) -> Iterator[str]:
     if kalibr is None:
-        classes = ", ".join(IMU_CLASSES)
-        yield f"    # The default class of {classes}. Better: the densities of the data sheet or of an Allan variance,"
+        yield "    # The noise of a class. Better: the densities of the data sheet or of an Allan variance,"
         yield "    # {gyro: , gyro_walk: , accel: , accel_walk: }, in rad/s/sqrt(Hz), rad/s^2/sqrt(Hz), m/s^2/sqrt(Hz),"
         yield "    # m/s^3/sqrt(Hz)."
         yield f"    noise: {DEFAULT_CLASS}"
