@@ -19,7 +19,7 @@ from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
-{kalibr}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
+{frames}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor: the scatter of segments over the predicted one; formal = std / factor. Those of roll_pitch_yaw,
 #   R = Rz(yaw) Ry(pitch) Rx(roll), are null within 5 std of gimbal lock (pitch 90 deg).
@@ -32,7 +32,8 @@ HEADER = """\
 # The full covariance and all residuals are in result.npz.
 """
 RPY = "roll_pitch_yaw"
-KALIBR = "#   (Kalibr's T_cam_imu is the inverse; see camchain-imucam.yaml.)\n"
+IMU = "#   The imu frame has the axes of the gyroscope, and its origin at the accelerometer.\n"
+KALIBR = "#   Kalibr's T_cam_imu is the inverse, in the axes of the accelerometer; see camchain-imucam.yaml.\n"
 
 
 def calibration_yaml(calibration: Calibration) -> str:
@@ -55,10 +56,10 @@ def calibration_yaml(calibration: Calibration) -> str:
         "notes": list(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
-    kalibr = KALIBR if c.lenses else ""
+    frames = "" if c.imu is None else IMU + (KALIBR if c.lenses else "")
     version = c.versions.get("icalib", "of unknown version")
     header = HEADER.format(
-        version=version, key=pose_key(c), body=body_name(c), reference=reference_name(c), kalibr=kalibr
+        version=version, key=pose_key(c), body=body_name(c), reference=reference_name(c), frames=frames
     )
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
 
