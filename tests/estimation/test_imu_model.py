@@ -23,7 +23,7 @@ def model(intrinsics, rate, force):
 
 
 def corrected(intrinsics, gyro, accel):
-    F, G, H = correction_matrices(intrinsics)
+    F, G, H, _ = correction_matrices(intrinsics)
     return G @ gyro + H @ accel, F @ accel
 
 

@@ -154,7 +154,7 @@ def test_openvins_imu_model_gives_the_readings(calibration: Calibration, tmp_pat
     rate, force = np.array([0.3, -0.7, 1.1]), np.array([1.0, 2.0, -9.0])
     gyro = M["Tw"] @ M["R_IMUtoGYRO"] @ rate + M["Tg"] @ force  # OpenVINS' documentation, "IMU intrinsics"
     accel = M["Ta"] @ M["R_IMUtoACC"] @ force
-    F, G, H = correction_matrices(x)
+    F, G, H, _ = correction_matrices(x)
     np.testing.assert_allclose(F @ accel, force, atol=1e-12)
     np.testing.assert_allclose(G @ gyro + H @ accel, rate, atol=1e-12)
     assert imu["gyroscope_noise_density"] == 1.6e-4 and imu["update_rate"] == 200.0

@@ -167,7 +167,7 @@ def test_imu_intrinsics_and_poses_are_those_of_kalibrs_frame(calibration: Calibr
     w, f, gyro = to_accel @ rate, to_accel @ force, imu["gyroscopes"]
     C = np.array(gyro["C_gyro_i"])
     reading = gyro["M"] @ C @ w + gyro["A"] @ C @ f  # Kalibr, IccSensors.py
-    F, G, H = correction_matrices(x)
+    F, G, H, _ = correction_matrices(x)
     accel = imu["accelerometers"]["M"] @ f
     np.testing.assert_allclose(F @ accel, force, atol=1e-12)
     np.testing.assert_allclose(G @ reading + H @ accel, rate, atol=1e-12)

@@ -28,6 +28,12 @@ KALIBR_MODELS = {
     "double-sphere": ("ds", "none", 2),
     "omni-radtan": ("omni", "radtan", 1),
 }
+KALIBR_NOISE = {  # density in a rig file -> in an imu file
+    "gyro": "gyroscope_noise_density",
+    "gyro_walk": "gyroscope_random_walk",
+    "accel": "accelerometer_noise_density",
+    "accel_walk": "accelerometer_random_walk",
+}
 SAME_INSTANT_S = 0.025  # images of two cameras at most this far apart count as simultaneous
 
 
@@ -77,10 +83,7 @@ def imu_yaml(calibration: Calibration) -> str:
     noise = c.rig["sensors"][c.imu]["noise"]
     data: dict[str, Any] = {
         "T_i_b": np.eye(4).tolist(),
-        "accelerometer_noise_density": float(noise["accel"]),
-        "accelerometer_random_walk": float(noise["accel_walk"]),
-        "gyroscope_noise_density": float(noise["gyro"]),
-        "gyroscope_random_walk": float(noise["gyro_walk"]),
+        **{theirs: float(noise[ours]) for ours, theirs in KALIBR_NOISE.items()},
         "model": "calibrated",
         "rostopic": f"/{c.imu}",
         "time_offset": 0.0,

@@ -21,7 +21,7 @@ from icalib.export.common import (
     topic,
     yaml_text,
 )
-from icalib.export.kalibr import cam_overlaps, lower
+from icalib.export.kalibr import KALIBR_NOISE, cam_overlaps, lower
 from icalib.geometry import so3
 from icalib.result import Calibration
 
@@ -83,10 +83,7 @@ def _imu(c: Calibration, imu: str) -> str:
     noise, x = c.rig["sensors"][imu]["noise"], imu_values(c)
     data = {
         "T_i_b": np.eye(4).tolist(),
-        "accelerometer_noise_density": float(noise["accel"]),
-        "accelerometer_random_walk": float(noise["accel_walk"]),
-        "gyroscope_noise_density": float(noise["gyro"]),
-        "gyroscope_random_walk": float(noise["gyro_walk"]),
+        **{theirs: float(noise[ours]) for ours, theirs in KALIBR_NOISE.items()},
         "rostopic": topic(c, imu, f"/{imu}"),
         "time_offset": 0.0,
         "update_rate": float(c.rates[imu]),

@@ -36,25 +36,12 @@ def _lower_inverse(m):
 
 
 @njit(cache=True, nogil=True)
-def sensitivity(intrinsics):
-    """Matrix A_g (3, 3) of the intrinsics (24,)."""
-    out = np.empty((3, 3))
-    for i in range(3):
-        for j in range(3):
-            out[i, j] = intrinsics[15 + 3 * i + j]
-    return out
-
-
-@njit(cache=True, nogil=True)
 def correction_matrices(intrinsics):
-    """Matrices F, G, H that invert the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a)."""
+    """Matrices F, G, H that invert the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a); and G A_g."""
     ma, mg = np.eye(3), np.eye(3)
     for n in range(6):
         ma[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[n]
         mg[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[6 + n]
     F, G = tmul3(so3.exp(intrinsics[12:15]), _lower_inverse(ma)), _lower_inverse(mg)
-    H = mul3(mul3(G, sensitivity(intrinsics)), F)
-    for i in range(3):
-        for j in range(3):
-            H[i, j] = -H[i, j]
-    return F, G, H
+    GA = mul3(G, intrinsics[15:24].reshape((3, 3)))
+    return F, G, -mul3(GA, F), GA

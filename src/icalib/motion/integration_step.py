@@ -15,8 +15,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.geometry.small import mul3
-from icalib.motion.imu_model import correction_matrices, sensitivity
+from icalib.motion.imu_model import correction_matrices
 
 _1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
 _1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0
@@ -46,8 +45,8 @@ def correction(intrinsics):
     """Matrices (6, 9), row by row: F, G, H (see `correction_matrices`); C = Exp(r), J_r(r) and G A_g (see
     `imu_model`)."""
     r, by = intrinsics[12:15], np.empty((6, 9))
-    F_, G_, H_ = correction_matrices(intrinsics)
-    matrices = F_, G_, H_, so3.exp(r), so3.right_jacobian(r), mul3(G_, sensitivity(intrinsics))
+    F_, G_, H_, GA = correction_matrices(intrinsics)
+    matrices = F_, G_, H_, so3.exp(r), so3.right_jacobian(r), GA
     for n in range(6):
         for i in range(3):
             for j in range(3):

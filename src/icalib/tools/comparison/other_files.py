@@ -9,33 +9,28 @@ import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue, read_yaml
 from icalib.errors import CalibrationError
+from icalib.export.kalibr import KALIBR_NOISE
 from icalib.export.urdf_tree import read_urdf
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.tools.comparison.results import DENSITIES, noise_quantities, quantity
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown
 from icalib.tools.inspection.kalibr import MODELS
 
-_KALIBR_NOISE = {
-    "gyro": "gyroscope_noise_density",
-    "gyro_walk": "gyroscope_random_walk",
-    "accel": "accelerometer_noise_density",
-    "accel_walk": "accelerometer_random_walk",
-}
 _ROUNDING = 1e-3  # largest deviation of R R^T from the identity, by printed digits
 
 
 def is_kalibr(entries: Mapping[str, YamlValue]) -> bool:
     """Whether the entries of a YAML file are those of a camchain or an imu file."""
     inside = [set(value.entries()) for value in entries.values() if value.is_mapping]
-    return any({"camera_model"} <= keys or {_KALIBR_NOISE["gyro"]} <= keys for keys in [set(entries), *inside])
+    return any({"camera_model"} <= keys or {KALIBR_NOISE["gyro"]} <= keys for keys in [set(entries), *inside])
 
 
 def side_of_kalibr(root: YamlValue) -> Side:
     """The side that a Kalibr camchain or imu file describes. Raises RigError naming line and field."""
     entries = root.entries()
-    parts = {"imu0": root} if _KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
+    parts = {"imu0": root} if KALIBR_NOISE["gyro"] in entries else {n: v for n, v in entries.items() if v.is_mapping}
     cameras = {n: v.entries() for n, v in parts.items() if "camera_model" in v.entries()}
-    imus = {n: v.entries() for n, v in parts.items() if _KALIBR_NOISE["gyro"] in v.entries()}
+    imus = {n: v.entries() for n, v in parts.items() if KALIBR_NOISE["gyro"] in v.entries()}
     has_imu = bool(imus) or any({"T_cam_imu", "T_imu_cam"} & set(fields) for fields in cameras.values())
     body = next(iter(imus), "imu") if has_imu else next(iter(cameras))
     poses, T_gyro_imu = {body: np.eye(4)}, _T_gyro_imu(Path(root.file))
@@ -47,8 +42,8 @@ def side_of_kalibr(root: YamlValue) -> Side:
             shift = np.array([fields["timeshift_cam_imu"].number()])
             quantities[name, "time_offset"] = quantity(TIME_OFFSET, shift, unknown(1))
     for name, fields in list(imus.items())[:1]:
-        parts[name].record(tuple(_KALIBR_NOISE.values()), tuple(k for k in fields if k not in _KALIBR_NOISE.values()))
-        quantities |= noise_quantities(name, {key: fields[_KALIBR_NOISE[key]].positive() for key in DENSITIES})
+        parts[name].record(tuple(KALIBR_NOISE.values()), tuple(k for k in fields if k not in KALIBR_NOISE.values()))
+        quantities |= noise_quantities(name, {key: fields[KALIBR_NOISE[key]].positive() for key in DENSITIES})
     lenses = {n: lens for n, fields in cameras.items() if (lens := _lens(fields)) is not None}
     return Side(root.file, "Kalibr file", body, has_imu, poses, quantities=quantities, lenses=lenses)
 

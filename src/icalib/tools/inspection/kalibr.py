@@ -11,24 +11,13 @@ import numpy as np
 import yaml
 
 from icalib.errors import RigError
+from icalib.export.kalibr import KALIBR_MODELS, KALIBR_NOISE
 from icalib.geometry.targets import AprilGrid, Checkerboard, Target
 
 _LARGEST_BYTES = 100_000  # larger YAML files are not read, as they are not written by hand
-_DENSITIES = {  # in a rig file: in Kalibr's
-    "gyro": "gyroscope_noise_density",
-    "gyro_walk": "gyroscope_random_walk",
-    "accel": "accelerometer_noise_density",
-    "accel_walk": "accelerometer_random_walk",
-}
 # Kalibr's camera and distortion model -> icalib's model, and the number of coefficients before the focal lengths in
 # Kalibr's intrinsics, which icalib counts as distortion.
-MODELS = {
-    ("pinhole", "radtan"): ("pinhole-radtan", 0),
-    ("pinhole", "equidistant"): ("pinhole-equidistant", 0),
-    ("eucm", "none"): ("eucm", 2),
-    ("ds", "none"): ("double-sphere", 2),
-    ("omni", "radtan"): ("omni-radtan", 1),
-}
+MODELS = {(camera, distortion): (model, before) for model, (camera, distortion, before) in KALIBR_MODELS.items()}
 Entry = TypeVar("Entry")
 
 
@@ -175,7 +164,7 @@ def _camera(file: str, name: str, data: dict[str, Any]) -> KalibrCamera:
 
 
 def _imu(file: str, _: str, data: dict[str, Any]) -> KalibrImu:
-    densities = {name: _positive(data, field, file) for name, field in _DENSITIES.items()}
+    densities = {name: _positive(data, field, file) for name, field in KALIBR_NOISE.items()}
     return KalibrImu(file, str(data.get("rostopic", "")), densities)
 
 
