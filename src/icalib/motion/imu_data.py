@@ -24,8 +24,6 @@ MIN_GAP_S, MIN_GAP_PERIODS = 0.01, 3.0  # an interval longer than both, seconds 
 MOTION_CORRELATION_S = 0.1
 # see `_is_dense`: jumping rates at 20 Hz move a time offset by a whole step, steady rates at 100 Hz by 0.6 ms
 MAX_DENSE_PERIOD_S = 0.025
-# of the squared accelerometer density: keeps the covariance definite if no stamp lies between two keyframes
-WITHIN_INTERVAL_SHARE = 1e-4
 CUBIC, QUINTIC = 4, 6  # readings that a polynomial of this degree passes through
 
 
@@ -151,8 +149,9 @@ class ImuData:
         """
         t = stream.seconds
         dt = np.diff(t)
-        # Columns as in `ImuData`: the third one is the deviation from the mean force within an interval.
-        variance = np.tile([noise.gyro**2, noise.accel**2, WITHIN_INTERVAL_SHARE * noise.accel**2], (len(dt), 1))
+        # Columns as in `ImuData`. The density is that of white noise in continuous time, within an interval, too: noise
+        # that is constant between readings makes slow readings stiff, and the normal equations singular in numbers.
+        variance = np.tile([noise.gyro**2, noise.accel**2, noise.accel**2], (len(dt), 1))
         gap = dt > max(MIN_GAP_S, MIN_GAP_PERIODS * _period(t))
         data = cls(
             stream.name,
