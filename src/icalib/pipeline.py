@@ -32,6 +32,8 @@ from icalib.sensors import call_kind
 from icalib.validation import assess, stated_words, visited
 
 READING_SHARE, DETECTION_SHARE = 0.1, 0.8  # of the total time, without and with detection in images
+# of the prior uncertainty of a guess: no standard deviation is larger, but that of singular normal equations
+SINGULAR_SIGMA = 1e3
 SHORTEST_S = 1.0  # shortest IMU stream that is accepted; time offsets need 4 s
 
 
@@ -165,14 +167,23 @@ def _calibrate(
     clock.lap("solving")
     progress("assessing the result", 0.9)
     result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
-    _refuse_no_numbers(result)
+    _refuse_no_numbers(result, rig)
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps)
 
 
-def _refuse_no_numbers(result: Calibration) -> None:
-    """Raises EstimationError for an estimate that is not finite or a NaN sigma: implausible input values overflow."""
+def _refuse_no_numbers(result: Calibration, rig: Rig) -> None:
+    """Raises EstimationError for an estimate that is not finite or a NaN sigma, as implausible input values overflow,
+    and for standard deviations that only singular normal equations have."""
     for group in result.groups:
+        sensor = rig.sensors.get(group.sensor)
+        limit = np.inf if sensor is None else SINGULAR_SIGMA * sensor.spec(group.name).prior_sigma
+        if group.std.max(initial=0.0) > limit:
+            raise EstimationError(
+                f"{group.sensor}: the normal equations of {group.name.replace('_', ' ')} are singular to within "
+                "rounding, so that it has no standard deviation. The noise in the rig file is too small, or the motion "
+                "too poor: state noise that the sensors have, or record more turns and accelerations."
+            )
         if not np.isfinite(group.value).all() or np.isnan(group.std).any():
             raise EstimationError(
                 f"{group.sensor}: the estimate of {group.name} is not finite, because a value in the recording "

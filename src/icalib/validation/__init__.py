@@ -8,6 +8,8 @@ A kind of sensor has a part in it by functions of its `assess` facet. All are op
     notes(inputs, estimate, timeline)               sentences on its data and noise
     ambiguities(inputs, estimate, fits)             notes on other values that fit as well
     warnings(inputs, estimate)                      sentences on its data
+    inner_contradictions(inputs, estimate, segments)    sentences on measurements of one sensor that contradict one
+                                                    another, each with a change (B,) that standard deviations cover
     value_warnings(groups)                          warnings on estimates that cannot be right
     causes(inputs, estimate, groups, factor, relaxed_rig)   each a `Cause`: its values in the rig file that are wrong
     clock_causes(inputs, estimate)                  each a `Cause`: clocks that the model leaves out

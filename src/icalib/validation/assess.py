@@ -50,8 +50,11 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     """The result of the estimate `determined`. against: values of the rig file that the data contradict so strongly
     that other faults of the estimate may follow from them."""
     estimate, rig = determined.estimate, inputs.rig
-    observability = _observed(inputs, determined, _column_names(inputs))
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
+    contradicting = tuple(call_all_kinds("assess", "inner_contradictions", inputs, estimate, segments))
+    changes = [change for _, change in contradicting]
+    determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, *changes]))
+    observability = _observed(inputs, determined, _column_names(inputs))
     groups = _groups(inputs, determined, observability, VarianceParts.of(determined, segments))
     validation = cross_validation(segments, [s for s in (rig.reference,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, _keyframe_instants(inputs, estimate.outcome.state), rig.reference)
@@ -63,6 +66,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     warnings = (
         *grave,
         *(c.sentence for c in causes if not c.grave),
+        *(sentence for sentence, _ in contradicting if sentence),
         *_warnings(inputs, estimate, groups),
         *scatter_warnings(factors, segments is not None, validation),
     )

@@ -33,6 +33,11 @@ class PieceGradient(NamedTuple):
     chain: np.ndarray
     calib: np.ndarray
 
+    @classmethod
+    def of(cls, piece: Piece) -> PieceGradient:
+        """The gradient in the sums of `piece`, before it is eliminated."""
+        return cls(piece.first, piece.side[:, :, -1].copy(), piece.calib[:-1, -1].copy())
+
     def add(self, piece: Piece, column: int) -> None:
         """Adds the gradient to `column` of `piece`. A keyframe that two pieces share counts in the earlier one, the
         calibration parameters in the piece of the segment's first keyframe."""
@@ -103,8 +108,7 @@ class Segments:
     def alone(self, g: int, scratch: Residuals) -> tuple[PieceGradient, np.ndarray]:
         """Gradient of segment `g`, and its sums (B + 1, B + 1) with its keyframes eliminated."""
         piece = self.piece(g, scratch)
-        gradient = PieceGradient(piece.first, piece.side[:, :, -1].copy(), piece.calib[:-1, -1].copy())
-        return gradient, marginalise(piece)
+        return PieceGradient.of(piece), marginalise(piece)
 
     def together(self, gradients: Sequence[PieceGradient], scratch: Residuals) -> np.ndarray:
         """System (B + G + 1, B + G + 1) of the calibration parameters, the joint trajectory eliminated. Column B + g is

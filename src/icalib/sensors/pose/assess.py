@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs
-from icalib.motion.factor import pairs_of
+from icalib.estimate.problem.inputs import Inputs, with_association
+from icalib.estimate.residual_statistics.score_test import LeftOut, score_test
+from icalib.estimate.residual_statistics.segments import Segments
+from icalib.motion.factor import Whitened, of_type, output_at, pairs_of
+from icalib.observability.contradictions import SIGMAS
+from icalib.optim.arrowhead import NotDefiniteError, solve
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information
 from icalib.result import SensorFit
 from icalib.result.excess import excess, times
 from icalib.result.row_records import lag_one_correlation
 from icalib.result.timeline import Timeline
 from icalib.rig import PoseSensor, Rig
-from icalib.sensors.pose.residual import PoseFactor, PoseNoise
+from icalib.sensors.pose.residual import POSE_KINDS, PoseFactor, PoseNoise, RelativePosesFactor
 
 # Lag-one autocorrelation of residuals: a warning is given above the first value (absolute poses), or below minus the
 # second (relative poses). It is 0 for the assumed noise, and -0.5 for differences of poses with independent noise.
 MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
+# Standard deviations of a difference between rotations and positions that is covered: chance exceeds them in 1 of 80.
+COVERED_SIGMAS = 2.5
 UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 
 
@@ -47,24 +55,89 @@ def _source(given: float | None) -> str:
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
+def inner_contradictions(
+    inputs: Inputs, estimate: Estimate, segments: Segments | None
+) -> Iterator[tuple[str, np.ndarray]]:
+    """For each pose sensor whose positions are turned against its rotations: a sentence, empty below SIGMAS, and the
+    change (B,) of the calibration parameters to the farther of two estimates: by its rotations, or by its positions."""
+    outcome = estimate.outcome
+    if segments is None or not outcome.converged:
+        return
+    for factor, _ in pairs_of(estimate.problem.factors, outcome.residuals, PoseFactor):
+        found = score_test(segments, outcome, factor.with_turned_positions, 3, COVERED_SIGMAS)
+        if found is None:
+            continue
+        relative, change = inputs.sensor(factor.name).kind == "relative", found.change.copy()
+        columns = inputs.layout.columns(factor.name, "rotation")
+        if relative and columns.min() >= 0:
+            by_positions = change[columns] + found.value
+            change[columns] = np.where(np.abs(by_positions) > np.abs(change[columns]), by_positions, change[columns])
+        yield _turned_words(factor.name, relative, found) if found.sigmas > SIGMAS else "", change
+
+
+def _turned_words(name: str, relative: bool, found: LeftOut) -> str:
+    """A sentence on positions that are turned against rotations."""
+    what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
+    angle = float(np.linalg.norm(found.value))
+    axis = ", ".join(f"{-x:.2f}" for x in found.value / angle)
+    return (
+        f"rotations and {what} of {name} contradict each other: its {what} are turned by {np.rad2deg(angle):.2g} deg, "
+        f"{found.sigmas:.0f} standard deviations, about the axis ({axis}) of its {axes}; the printed standard "
+        "deviations cover the difference. To rely on its rotations, state a position_noise ten times as large as noted."
+    )
+
+
 def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     """Warnings on residuals that are correlated in time: poses are filtered or drift, or the kind (absolute, relative)
     is wrong."""
-    kinds = {s.name: s.kind for s in inputs.rig.poses}
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PoseFactor):
-        for what, components in (("rotation", rows.residual[:, :3]), ("position", rows.residual[:, 3:])):
-            correlation = lag_one_correlation(components)
-            if kinds[factor.name] == "absolute" and correlation > MAX_LAG_ONE_CORRELATION:
-                yield (
-                    f"the {what} residuals of {factor.name} follow one another (correlation {correlation:.2f} from "
-                    "pose to pose): its poses are filtered, or drift, so all looks better known than it is; trust the "
-                    "empirical factor, or try kind: relative, which lets poses drift."
-                )
-            if kinds[factor.name] == "relative" and correlation < -MAX_LAG_ONE_ANTICORRELATION:
+        sensor: PoseSensor = inputs.sensor(factor.name)
+        correlations = _correlations(rows)
+        for what, correlation in correlations.items():
+            if sensor.kind == "relative" and correlation < -MAX_LAG_ONE_ANTICORRELATION:
                 yield (
                     f"the {what} residuals of {factor.name} alternate (correlation {correlation:.2f} from step to "
                     "step), as those of poses that are noisy but do not drift; try kind: absolute."
                 )
+        following = [(w, c) for w, c in correlations.items() if c > MAX_LAG_ONE_CORRELATION]
+        if sensor.kind == "absolute" and following:
+            what, correlation = " and ".join(w for w, _ in following), max(c for _, c in following)
+            yield (
+                f"the {what} residuals of {factor.name} follow one another (correlation {correlation:.2f} from pose to "
+                "pose): its poses are filtered, or drift; trust the empirical factor. "
+                f"{_trial(inputs, estimate, sensor)}"
+            )
+
+
+def _correlations(rows: Whitened) -> dict[str, float]:
+    """Lag-one autocorrelation of the residuals of each kind."""
+    return {kind: lag_one_correlation(rows.residual[:, columns]) for kind, columns in POSE_KINDS.items()}
+
+
+def _trial(inputs: Inputs, estimate: Estimate, sensor: PoseSensor) -> str:
+    """A sentence on whether kind: relative would help, from its residuals and normal equations at the solution."""
+    if inputs.rig.imu is None or inputs.rig.assumes_motion:
+        return "Relative poses need an IMU."
+    tried = replace(inputs, rig=inputs.rig.with_sensors(replace(sensor, kind="relative")))
+    tried = with_association(tried, inputs.association)
+    model, state = estimate.measurement_model, estimate.outcome.state
+    (factor,) = of_type(model.problem(tried, state).factors, RelativePosesFactor)[-1:]
+    rows = output_at(factor, state)
+    rotation, position = (float(np.sqrt(np.mean(rows.residual[:, c] ** 2))) for c in POSE_KINDS.values())
+    noise = replace(factor.noise, rotation=rotation * factor.noise.rotation, position=position * factor.noise.position)
+    problem = replace(model, noise={**model.noise, sensor.name: noise}).problem(tried, state)
+    pieces = problem.pieces()
+    problem.linearise(state, pieces, problem.residuals())
+    try:
+        information = solve(pieces, problem.n_keyframes, problem.tolerance).information
+    except NotDefiniteError:
+        information = np.zeros((problem.layout.size, problem.layout.size))
+    if essential_information(information, problem.tolerance, problem.layout) < UNOBSERVABLE_BELOW:
+        return "Tried kind: relative, which lets poses drift: it would not determine all parameters."
+    worst = max(_correlations(rows).values(), key=abs)
+    if -MAX_LAG_ONE_ANTICORRELATION <= worst <= MAX_LAG_ONE_CORRELATION:
+        return f"Tried kind: relative, which lets poses drift: its steps are white (correlation {worst:.2f}); write it."
+    return f"Tried kind: relative, which lets poses drift: its steps are not white, either (correlation {worst:.2f})."
 
 
 def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:

@@ -13,12 +13,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import ClassVar
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from icalib.data.measurements import PoseStream
+from icalib.geometry import so3
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
@@ -62,6 +63,12 @@ class PoseFactor(RowFactor, ABC):
     rotation: np.ndarray
     position: np.ndarray
     noise: PoseNoise
+
+    def with_turned_positions(self, turn: np.ndarray) -> Self:
+        """The same measurements with all positions rotated by the vector `turn` (3,) [rad], about the origin of their
+        axes."""
+        factor: Any = self
+        return replace(factor, position=self.position @ so3.exp(turn).T)
 
     @property
     @abstractmethod
