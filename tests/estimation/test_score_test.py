@@ -65,7 +65,7 @@ def test_the_step_is_that_of_an_estimate_with_turned_positions(kind):
     turn = Rotation.from_matrix(outcome.state.values["mocap0", "rotation"].T @ after.values["mocap0", "rotation"])
     np.testing.assert_allclose(moved, found.change[columns], atol=1e-3)
     expected = found.change[inputs.layout.columns("mocap0", "rotation")]
-    np.testing.assert_allclose(turn.as_rotvec(), expected, atol=0.15 * np.linalg.norm(expected) + 1e-4)
+    np.testing.assert_allclose(turn.as_rotvec(), expected, atol=0.15 * float(np.linalg.norm(expected)) + 1e-4)
 
 
 def test_a_contradiction_is_said_and_covered():

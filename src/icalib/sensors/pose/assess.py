@@ -11,7 +11,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs, with_association
 from icalib.estimate.residual_statistics.score_test import LeftOut, score_test
 from icalib.estimate.residual_statistics.segments import Segments
-from icalib.motion.factor import Whitened, of_type, output_at, pairs_of
+from icalib.motion.factor import Whitened, output_at, pairs_of
 from icalib.observability.contradictions import SIGMAS
 from icalib.optim.arrowhead import NotDefiniteError, solve
 from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information
@@ -121,20 +121,21 @@ def _trial(inputs: Inputs, estimate: Estimate, sensor: PoseSensor) -> str:
     tried = replace(inputs, rig=inputs.rig.with_sensors(replace(sensor, kind="relative")))
     tried = with_association(tried, inputs.association)
     model, state = estimate.measurement_model, estimate.outcome.state
-    (factor,) = of_type(model.problem(tried, state).factors, RelativePosesFactor)[-1:]
-    rows = output_at(factor, state)
-    rotation, position = (float(np.sqrt(np.mean(rows.residual[:, c] ** 2))) for c in POSE_KINDS.values())
-    noise = replace(factor.noise, rotation=rotation * factor.noise.rotation, position=position * factor.noise.position)
+    factor = model.problem(tried, state).factors[sensor.name, "poses"]
+    assert isinstance(factor, RelativePosesFactor)
+    residual = output_at(factor, state).residual
+    size = {kind: max(float(np.sqrt(np.mean(residual[:, c] ** 2))), 1e-12) for kind, c in POSE_KINDS.items()}
+    noise = replace(factor.noise, **{kind: size[kind] * getattr(factor.noise, kind) for kind in POSE_KINDS})
     problem = replace(model, noise={**model.noise, sensor.name: noise}).problem(tried, state)
-    pieces = problem.pieces()
-    problem.linearise(state, pieces, problem.residuals())
+    pieces, rows = problem.pieces(), problem.residuals()
+    problem.linearise(state, pieces, rows)
     try:
         information = solve(pieces, problem.n_keyframes, problem.tolerance).information
     except NotDefiniteError:
         information = np.zeros((problem.layout.size, problem.layout.size))
     if essential_information(information, problem.tolerance, problem.layout) < UNOBSERVABLE_BELOW:
         return "Tried kind: relative, which lets poses drift: it would not determine all parameters."
-    worst = max(_correlations(rows).values(), key=abs)
+    worst = max(_correlations(rows[factor.key]).values(), key=abs)
     if -MAX_LAG_ONE_ANTICORRELATION <= worst <= MAX_LAG_ONE_CORRELATION:
         return f"Tried kind: relative, which lets poses drift: its steps are white (correlation {worst:.2f}); write it."
     return f"Tried kind: relative, which lets poses drift: its steps are not white, either (correlation {worst:.2f})."
