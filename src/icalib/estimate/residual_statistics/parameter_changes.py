@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from icalib.estimate.residual_statistics.segments import Segments
-from icalib.optim.calib_block import complement
+from icalib.optim.calib_block import UNOBSERVABLE_BELOW, complement
 from icalib.optim.state import Key
 from icalib.rig import Sensor
 
@@ -106,9 +106,12 @@ class _Form:
         cross = np.einsum("g,gij->ij", pattern, rows) @ self.root
         common = self.root.T @ self.gradient.sum(axis=0)
         g = np.einsum("g,gi->i", pattern, self.gradient[:, columns]) - cross @ common
-        covariance = np.linalg.inv(A - cross @ cross.T)
-        step, t = -covariance @ g, self.tolerance[columns]
-        return Change(key, kind, second, t * step, t * np.sqrt(np.diag(covariance)), float(-g @ step))
+        # Singular directions, also negative ones within rounding, do not move, and have a large standard deviation.
+        values, vectors = np.linalg.eigh(A - cross @ cross.T)
+        variances = 1.0 / np.maximum(values, UNOBSERVABLE_BELOW)
+        step = -vectors @ np.where(values > UNOBSERVABLE_BELOW, variances * (vectors.T @ g), 0.0)
+        t, std = self.tolerance[columns], np.sqrt(vectors**2 @ variances)
+        return Change(key, kind, second, t * step, t * std, float(-g @ step))
 
 
 def heterogeneity(parts: Segments) -> float:
