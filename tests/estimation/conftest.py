@@ -216,7 +216,7 @@ def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **change
         times=stream.seconds,
         keyframe=keyframe,
         keep=np.ones(n, dtype=bool),
-        noise=CornerNoise(np.full(n, 0.2), np.zeros(0), np.zeros((n, 0))),
+        noise=CornerNoise(np.full(n, 0.2), np.zeros(0), np.zeros((n, 2, 0))),
         direction=np.zeros((0, 2)),
         bodies=setup.bodies,
         layout=setup.layout,

@@ -126,9 +126,9 @@ def test_weights_and_cost(setup, factor_of, loss):
 def test_the_common_error_is_the_one_that_explains_the_image_best(setup, factor_of, loss, tolerance, m):
     factor = noisy(factor_of(setup, 0), size=0.6)
     n, rng, tau = len(factor.stream.uv), np.random.default_rng(3), np.array([0.7, 0.5, 0.3])[:m]
-    field = np.column_stack([np.ones(n), rng.normal(size=(n, 2))])[:, :m].copy()
-    shift = rng.normal(size=(len(factor.times), 2, m)) * tau
-    uv = factor.stream.uv + np.einsum("nk,nak->na", field, shift[factor.stream.image])
+    field = rng.normal(size=(n, 2, m))
+    shift = rng.normal(size=(len(factor.times), m)) * tau
+    uv = factor.stream.uv + np.einsum("nak,nk->na", field, shift[factor.stream.image])
     noise = CornerNoise(np.full(n, 0.6), tau, field, loss, 2.0)
     factor = replace(factor, stream=replace(factor.stream, uv=uv), noise=noise)
     cost, out, _ = run(factor, setup.state)
@@ -137,24 +137,23 @@ def test_the_common_error_is_the_one_that_explains_the_image_best(setup, factor_
         mine = factor.stream.image == i
 
         def image_cost(c, mine=mine):
-            c = c.reshape(2, m)
-            error = np.linalg.norm(out.residual[mine] + field[mine] @ c.T, axis=1)
+            error = np.linalg.norm(out.residual[mine] + field[mine] @ c, axis=1)
             return losses(loss, 2.0, error / 0.6)[1].sum() + 0.5 * ((c / tau) ** 2).sum()
 
-        least = minimize(image_cost, np.zeros(2 * m), tol=1e-12, method="BFGS", options={"gtol": 1e-6})
+        least = minimize(image_cost, np.zeros(m), tol=1e-12, method="BFGS", options={"gtol": 1e-6})
         best += least.fun
         np.testing.assert_allclose(out.shared[i].ravel(), least.x, rtol=0, atol=max(tolerance, 1e-6))
     assert cost == pytest.approx(best, rel=tolerance)
 
 
 def test_estimating_the_common_error_explicitly_gives_the_same_normal_equations(setup, near, factor_of, dense):
-    """An affine field as six more unknowns of each image, eliminated by a dense Schur complement."""
+    """A shift and a delay as three more unknowns of each image, eliminated by a dense Schur complement."""
     factor = replace(
         noisy(factor_of(setup, 0)), keep=np.random.default_rng(4).random(len(factor_of(setup, 0).keep)) < 0.1
     )
     n = len(factor.stream.uv)
     uv = factor.stream.uv
-    field = np.column_stack([np.ones(n), (uv - [376.0, 240.0]) / 400.0])
+    field = np.concatenate([np.tile(np.eye(2), (n, 1, 1)), ((uv - [376.0, 240.0]) / 400.0)[:, :, None]], axis=2)
     tau = np.array([0.4, 0.3, 0.2])
     with_field = replace(factor, noise=replace(factor.noise, tau=tau, field=field))
     H, g = dense(run(with_field, near, sums=True)[2], factor.n_keyframes)
@@ -181,8 +180,8 @@ def whitened(factor, setup, state, field):
         [(residual(h * s * e) - residual(-h * s * e)) / (2 * h * s) for e, s in zip(basis, scale, strict=True)]
     ).T
     image, f = factor.stream.image[factor.keep], field[factor.keep]
-    F = np.hstack([(image == i)[:, None] * f for i in range(len(factor.times))]) / 0.2
-    return J, residual(np.zeros(len(basis))), np.kron(np.eye(2), F)
+    F = np.concatenate([(image == i)[:, None, None] * f for i in range(len(factor.times))], axis=2) / 0.2
+    return J, residual(np.zeros(len(basis))), np.concatenate([F[:, 0], F[:, 1]])
 
 
 @pytest.mark.parametrize("loss", ["none", "cauchy"])
@@ -214,7 +213,7 @@ def test_corners_left_out_are_as_if_they_were_not_there(setup, factor_of, dense)
         factor,
         stream=stream,
         keep=np.ones(keep.sum(), bool),
-        noise=replace(factor.noise, field=np.zeros((keep.sum(), 0))),
+        noise=replace(factor.noise, field=np.zeros((keep.sum(), 2, 0))),
     )
     cost_small, _, pieces_small = run(small, setup.state, sums=True)
     assert cost == pytest.approx(cost_small, rel=1e-12)

@@ -11,7 +11,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.assess import lens_models
-from icalib.sensors.camera.corner_noise import NoiseModel, estimate_noise, image_speed
+from icalib.sensors.camera.corner_noise import NoiseModel, estimate_noise, image_flow, image_speed
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 
@@ -32,11 +32,11 @@ def test_the_size_of_the_noise_is_found(unlike, setup_of, factor_of, stated, blu
     out.root[:] = 1.0
     factor = replace(factor, stream=replace(stream, sigma=sigma))
     camera, settings = Camera("cam0", "", "pinhole-radtan", (752, 480)), Settings(blur_noise=blurred)
-    model, large = estimate_noise(camera, settings, factor, out, speed, ())
+    model, large = estimate_noise(camera, settings, factor, out, speed)
     assert not large
     assert model.base == pytest.approx(BASE, rel=0.05)
     assert model.exposure == pytest.approx(EXPOSURE_S * blurred, rel=0.1)
-    noise = NoiseModel(BASE, EXPOSURE_S).noise(factor.stream, camera, settings, speed * blurred)
+    noise = NoiseModel(BASE, EXPOSURE_S).noise(factor.stream, settings, speed * blurred)
     np.testing.assert_allclose(noise.sigma, true, rtol=1e-12)
 
 
@@ -51,7 +51,7 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     stream, n = factor.stream, len(factor.stream.uv)
     sigma = np.where(rng.random(n) < 0.6, 1.0, 4.0)
     factor = replace(factor, stream=replace(stream, sigma=sigma))
-    speed = image_speed(factor, setup.state)
+    speed = image_speed(factor, image_flow(factor, setup.state))
     exposure = 1.5 * BASE / np.median(speed)
     true = np.hypot(BASE * factor.stream.relative_sigma, exposure * speed[stream.image])
     across = stream.uv[:, 0] - stream.uv[:, 0].mean()
@@ -61,7 +61,7 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     out.root[:] = 1.0
     camera = Camera("cam0", "", "pinhole-radtan", (752, 480), corner_noise_px=0.3 if stated else None)
     settings = Settings(blur_noise=True)
-    assert estimate_noise(camera, settings, factor, out, speed, ())[1] == large
+    assert estimate_noise(camera, settings, factor, out, speed)[1] == large
     fitted = SimpleNamespace(model=factor.model, rms=0.1)
     monkeypatch.setattr(lens_models, "compare_models", lambda *_: (fitted, fitted))
     outcome = SimpleNamespace(residuals={factor.key: out}, state=setup.state)

@@ -36,6 +36,7 @@ from icalib.optim.robust_weights import MIN_CURVATURE_RATIO
 from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.corner_statistics import DELAY, SHIFT
 from icalib.sensors.camera.features.surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
@@ -172,7 +173,7 @@ def corner_sample(
     # Few corners of each image, some of them far enough off that robust losses bend.
     sigma = rng.uniform(0.8, 1.2, n)
     noise = CornerNoise(
-        sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 3))[:, :field].copy(), loss, LOSS_SCALE
+        sigma, np.array([0.8, 0.6, 0.4])[:field], rng.normal(size=(n, 2, 3))[:, :, :field].copy(), loss, LOSS_SCALE
     )
     factor = factor_of(setup, camera, scheme)
     factor = replace(
@@ -199,15 +200,15 @@ def corner_sample(
         out, used = run(at)
         root, f, r = out.root[used], noise.field[used], out.residual[used]
         view = factor.views.of_corners(0, len(factor.views.image))[used]
-        e = r + np.einsum("nk,nak->na", f, out.shared[view])
+        e = r + np.einsum("nak,nk->na", f, out.shared[view])
         size = np.linalg.norm(e, axis=1)
         bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[used]))
         B = np.eye(2) + (bend - 1.0)[:, None, None] * np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
         B = np.block([[np.diag(root * B[:, i, j]) for j in range(2)] for i in range(2)])
         W = np.eye(2 * len(r))
         for i in range(len(factor.views.image) if field else 0):
-            F = root[:, None] * f * (view == i)[:, None]
-            W -= np.kron(np.eye(2), F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T))
+            F = np.concatenate([root[:, None] * f[:, axis] * (view == i)[:, None] for axis in range(2)])
+            W -= F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T)
         return (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
 
     def accumulate(at, piece, sums):
@@ -861,7 +862,7 @@ def test_rows_are_the_residuals_by_kind(sample):
     made, state = sample.made, sample.state
     out = output_at(made, state)
     rows, squares, sizes = made.rows(out, state), made.squares(out), made.sizes(out)
-    common = {kind for _, kind in squares if kind.startswith("common")}
+    common = {kind for _, kind in squares if kind in (SHIFT, DELAY)}
     assert {(r.sensor, r.kind) for r in rows} >= {key for key in squares if key[1] not in {*common, ON_PLANES}}
     for r in rows:
         assert r.residual.shape == r.sigma.shape == r.whitened.shape == r.root.shape

@@ -27,8 +27,8 @@ def cameras(unlike, setup_of, factor_of) -> list[CornerFactor]:
 
 def output(camera: CornerFactor, late: tuple[int, ...], tau: float) -> tuple[CornerFactor, CornerOutput]:
     """Normal errors, and 5 px more in `late` images; with a common error per image of `tau` px, none if it is zero."""
-    n, m, rng = len(camera.stream.uv), 1 if tau else 0, np.random.default_rng(3)
-    camera = replace(camera, noise=CornerNoise(np.full(n, 0.2), np.full(m, tau), np.ones((n, m))))
+    n, m, rng = len(camera.stream.uv), 2 if tau else 0, np.random.default_rng(3)
+    camera = replace(camera, noise=CornerNoise(np.full(n, 0.2), np.full(m, tau), np.tile(np.eye(2)[:, :m], (n, 1, 1))))
     out = camera.output(np.float64)
     out.residual[:] = NOISE_PX * rng.standard_normal((n, 2))
     out.residual[np.isin(camera.stream.image, late), 0] += 5.0

@@ -112,10 +112,10 @@ def problem(rig, recordings, request):
     state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, recordings))
     if real:
         state.values["board0", "shape"][:] = 1e-3
-    models = [NoiseModel(0.2, tau=(0.1,) if real else ()) for _ in rig.cameras]
+    models = [NoiseModel(0.2, tau=0.1 if real else 0.0) for _ in rig.cameras]
     streams, noise = inputs.measurements.cameras, MODEL.first_noises(rig.cameras, rig, inputs.measurements)
     for c, m, s in zip(rig.cameras, models, streams, strict=True):
-        noise[c.name] = dataclasses.replace(noise[c.name], corners=m.noise(s, c, settings))
+        noise[c.name] = dataclasses.replace(noise[c.name], corners=m.noise(s, settings))
     return assemble(inputs, state, noise), state
 
 

@@ -20,8 +20,8 @@ FEW_DOF = 2.0
 class Fit:
     """chi^2 of one kind of residual, number of residuals, and degrees of freedom left after the fit.
 
-    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error 0", 1,
-    ... for the errors that all corners of an image share.
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error" and
+    "stamp jitter" for the errors that all corners of an image share.
     """
 
     sensor: str

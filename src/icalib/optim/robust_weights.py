@@ -60,17 +60,16 @@ def _invert_small(M, out):
 @njit(cache=True, nogil=True, inline="always")
 def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
     """Weights of the n corners of one image, and their common error. Fills root (n,): square roots of the weights over
-    sigma (n,) px, 0 unless `keep`. Fills shared (2, m): coefficients of the common error [px]. Returns half the robust
-    chi^2.
+    sigma (n,) px, 0 unless `keep`. Fills shared (m,): coefficients of the common error. Returns half the robust chi^2.
 
-    res (n, 2) px; f (n, m): basis functions of the common error at each corner; precision (m,): prior information of
+    res (n, 2) px; f (n, 2, m): change of each corner per unit of each coefficient; precision (m,): prior information of
     the coefficients. Weights and common error depend on each other, so a few rounds of reweighting minimise the cost
     over the common error.
     """
-    n, m = len(keep), f.shape[1]
+    n, m = len(keep), f.shape[2]
     for k in range(m):
-        shared[0, k], shared[1, k] = 0.0, 0.0
-    M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty((2, m))
+        shared[k] = 0.0
+    M, inv, rhs = np.empty((m, m)), np.empty((m, m)), np.empty(m)
     rounds = 1 if m == 0 else (2, 8, 24)[loss]
     cost = 0.0
     for turn in range(rounds):
@@ -81,13 +80,13 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
                 continue
             u, v = res[i, 0], res[i, 1]
             for k in range(m):
-                u += shared[0, k] * f[i, k]
-                v += shared[1, k] * f[i, k]
+                u += shared[k] * f[i, 0, k]
+                v += shared[k] * f[i, 1, k]
             w, c, _ = weight(loss, scale, (u * u + v * v) / (sigma[i] * sigma[i]))
             root[i] = np.sqrt(w) / sigma[i]
             cost += c
         for k in range(m):
-            cost += 0.5 * precision[k] * (shared[0, k] ** 2 + shared[1, k] ** 2)
+            cost += 0.5 * precision[k] * shared[k] ** 2
         if turn == rounds - 1:
             return cost
         _common_error(res, root, f, precision, M, inv, rhs, shared)
@@ -96,25 +95,24 @@ def robust_weights(res, keep, f, precision, sigma, loss, scale, root, shared):
 
 @njit(cache=True, nogil=True, inline="always")
 def _common_error(res, root, f, precision, M, inv, rhs, shared):
-    """Coefficients (2, m) of the common error at given weights: ridge regression of -res on the basis functions f."""
-    m = f.shape[1]
+    """Coefficients (m,) of the common error at given weights: ridge regression of -res on the functions f."""
+    m = f.shape[2]
     for a in range(m):
-        rhs[0, a], rhs[1, a] = 0.0, 0.0
+        rhs[a] = 0.0
         for b in range(m):
             M[a, b] = precision[a] if a == b else 0.0
     for i in range(len(root)):
-        w = root[i] * root[i]
-        for a in range(m):
-            for b in range(m):
-                M[a, b] += w * f[i, a] * f[i, b]
-            rhs[0, a] += w * f[i, a] * res[i, 0]
-            rhs[1, a] += w * f[i, a] * res[i, 1]
+        for axis in range(2):
+            for a in range(m):
+                wf = root[i] * root[i] * f[i, axis, a]
+                for b in range(m):
+                    M[a, b] += wf * f[i, axis, b]
+                rhs[a] += wf * res[i, axis]
     _invert_small(M, inv)
     for a in range(m):
-        shared[0, a], shared[1, a] = 0.0, 0.0
+        shared[a] = 0.0
         for b in range(m):
-            shared[0, a] -= inv[a, b] * rhs[0, b]
-            shared[1, a] -= inv[a, b] * rhs[1, b]
+            shared[a] -= inv[a, b] * rhs[b]
 
 
 @njit(cache=True, nogil=True)
@@ -123,8 +121,8 @@ def add_common_error(res, f, shared, error):
     for i in range(len(res)):
         for axis in range(2):
             error[i, axis] = res[i, axis]
-            for k in range(f.shape[1]):
-                error[i, axis] += shared[axis, k] * f[i, k]
+            for k in range(f.shape[2]):
+                error[i, axis] += shared[k] * f[i, axis, k]
 
 
 @njit(cache=True, nogil=True)
@@ -147,26 +145,26 @@ def marginalise_shared(A, D, n, root, f, precision, G):
 
     The gradient by the common error is zero, because the cost is minimal over it.
     """
-    m = f.shape[1]
+    m = f.shape[2]
     M, inv = np.empty((m, m)), np.empty((m, m))
     C = np.empty((m, D))
+    for a in range(m):
+        for b in range(m):
+            M[a, b] = precision[a] if a == b else 0.0
+        for k in range(D):
+            C[a, k] = 0.0
     for axis in range(2):
-        for a in range(m):
-            for b in range(m):
-                M[a, b] = precision[a] if a == b else 0.0
-            for k in range(D):
-                C[a, k] = 0.0
         for i in range(n):
             for a in range(m):
-                wf = root[i] * f[i, a]
+                wf = root[i] * f[i, axis, a]
                 for b in range(m):
-                    M[a, b] += wf * root[i] * f[i, b]
+                    M[a, b] += wf * root[i] * f[i, axis, b]
                 for k in range(D):
                     C[a, k] += wf * A[k, axis * n + i]
-        _invert_small(M, inv)
-        for a in range(m):
-            for b in range(m):
-                for k in range(D):
-                    s = inv[a, b] * C[a, k]
-                    for c in range(D):
-                        G[k, c] -= s * C[b, c]
+    _invert_small(M, inv)
+    for a in range(m):
+        for b in range(m):
+            for k in range(D):
+                s = inv[a, b] * C[a, k]
+                for c in range(D):
+                    G[k, c] -= s * C[b, c]

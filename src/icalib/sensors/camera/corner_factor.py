@@ -7,8 +7,8 @@ K is the camera model, and P a point of the target, displaced by the shape of it
 so that all its corners share one camera pose. The Gram matrix of a view, over this pose and the parameters of camera
 and body, is summed first. The Jacobians of the pose by the state are then applied once per view.
 
-Corners of a view may share an error: a sum of functions of the image position with coefficients ~ N(0, tau^2). These
-coefficients are marginalised view by view.
+Corners of a view may share an error, the sum of `field` times coefficients ~ N(0, tau^2): a shift, and a delay times
+the image velocity. These coefficients are marginalised view by view.
 """
 
 from __future__ import annotations
@@ -57,8 +57,10 @@ VIEWS_PER_CHUNK = 64  # views that are projected at once; their arrays fit into 
 class CornerNoise:
     """Noise of the N corners of one camera.
 
-    sigma (N,) px per axis. tau (m,) px: standard deviations of the coefficients of the error that all corners of a view
-    share; field (N, m): its functions at each corner. loss: robust loss, with the threshold `loss_scale` in sigma."""
+    sigma (N,) px per axis. tau (m,): standard deviations of the coefficients of the error that all corners of a view
+    share; field (N, 2, m): change of each corner per unit of each coefficient. The coefficients are
+    none, or a shift (2) [px], or these and a delay [s], or a delay. loss: robust loss, with the threshold `loss_scale`
+    in sigma."""
 
     sigma: np.ndarray
     tau: np.ndarray
@@ -72,8 +74,8 @@ class CornerOutput:
     """Residuals of N corners in V views.
 
     residual (N, 2) px: predicted - measured, without the common error. root (N,) 1/px: square root of the robust
-    weight, over sigma; 0 if not in use. Both are in single precision, to save memory. shared (V, 2, m) px:
-    coefficients of each view's common error, which adds to the prediction."""
+    weight, over sigma; 0 if not in use. Both are in single precision, to save memory. shared (V, m): coefficients of
+    each view's common error, which adds to the prediction."""
 
     residual: np.ndarray
     root: np.ndarray
@@ -81,8 +83,8 @@ class CornerOutput:
 
     @classmethod
     def empty(cls, n: int, n_views: int, m: int, dtype: type = np.float32) -> CornerOutput:
-        """Arrays for n corners in `n_views` views, with m coefficients of the common error per axis."""
-        return cls(memory.mmap_zeros((n, 2), dtype), memory.mmap_zeros((n,), dtype), np.zeros((n_views, 2, m)))
+        """Arrays for n corners in `n_views` views, with m coefficients of the common error."""
+        return cls(memory.mmap_zeros((n, 2), dtype), memory.mmap_zeros((n,), dtype), np.zeros((n_views, m)))
 
 
 @dataclass(frozen=True)
@@ -211,8 +213,8 @@ class CornerFactor(FactorDefaults):
         error = np.empty((len(out.root), 2), np.float32)
         for v0, v1 in self.blocks():
             rows = self.corners_of(v0, v1)
-            shared = self.noise.field[rows, None, :] * out.shared[self.views.of_corners(v0, v1)]
-            error[rows] = out.residual[rows] + shared.sum(axis=2)
+            shared = out.shared[self.views.of_corners(v0, v1)]
+            error[rows] = out.residual[rows] + np.einsum("nik,nk->ni", self.noise.field[rows], shared)
         return error
 
     def chi2(self, out: CornerOutput) -> float:

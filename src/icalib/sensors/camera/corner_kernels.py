@@ -33,8 +33,8 @@ class Noise(NamedTuple):
     """Noise of all corners, and the robust loss.
 
     sigma (N,) px per axis; loss: number in `LOSSES`; scale: its threshold in sigma; curved: whether the normal
-    equations have the true curvature of the loss. field (N, m): functions of the error that a view shares; precision
-    (m,) 1/px^2: prior information of its coefficients."""
+    equations have the true curvature of the loss. field (N, 2, m): change of each corner per unit of each coefficient
+    of the error that a view shares; precision (m,): prior information of these coefficients."""
 
     sigma: np.ndarray
     loss: int
@@ -89,7 +89,7 @@ class CornerResidualArrays(NamedTuple):
     """Output arrays for the corners from number `first` on.
 
     residual (n, 2) px: predicted - measured, without the common error; root (n,) 1/px: square root of the robust
-    weight, over sigma; shared (v, 2, m) px: coefficients of the common error of each of v views."""
+    weight, over sigma; shared (v, m): coefficients of the common error of each of v views."""
 
     first: int
     residual: np.ndarray

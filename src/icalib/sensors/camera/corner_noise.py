@@ -1,11 +1,13 @@
 """Noise of corners, estimated from the residuals of a pass.
 
     sigma_n^2 = (base s_n)^2 + (exposure v_i)^2 + misfit^2      corner n of image i; v_i [px/s]: image speed (blur)
-    shared    ~ N(0, tau_k^2), independent in u and v           coefficients of the error that an image's corners share
+    shift     ~ N(0, tau^2), independent in u and v             that all corners of an image share
+    delay     ~ N(0, jitter^2)                                  of a stamp; moves all corners along their image velocity
 
 s_n is the detector's standard deviation of the corner over that of the median corner, 1 if the detector states none.
-base and exposure come from medians, which are robust to outliers. tau comes from the chi^2 of the shared errors over
-post-fit degrees of freedom, pass by pass (variance components; Foerstner 1979), because poses absorb most of the error.
+base and exposure come from medians, which are robust to outliers. tau and jitter come from the chi^2 of the shared
+errors over post-fit degrees of freedom, pass by pass (variance components; Foerstner 1979), because poses absorb most
+of the error. Jitter is modelled only if the stamps are, or were, uneven (`CornerStream.jitter_s`).
 
 The misfit is the error of the lens model. Near the border of the image it is many times its RMS, and a robust loss
 down-weights corners there. With other sensors this is wanted, because the border would bias their parameters. With
@@ -14,7 +16,7 @@ cameras alone the lens should fit the whole image, so a large misfit widens the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -30,7 +32,9 @@ from icalib.sensors.camera.corner_misfit import LensMisfit, lens_misfit
 INITIAL_CORNER_NOISE_PX = 0.5  # per axis, in the first pass: typical residual with a rough lens
 MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX = 1e-3, 5.0  # limits of tau: for finite weights, and against divergence
 INITIAL_COMMON_ERROR_PX = 0.1  # tau in the first pass that models the common error
-N_COMMON_ERRORS = 1  # number of functions of the common error: 1 is a shift; 3 would be an affine field
+MAX_INITIAL_JITTER_S = 3e-3  # in the first pass that models jitter; larger scatter is a rate that changes
+WIDE_JITTER = 3.0  # jitter of that pass over `CornerStream.jitter_s`: delays are then hardly pulled towards zero
+SIGNIFICANT_JITTER_STD = 5.0  # standard deviations of chi^2 of the delays without jitter; below, there is none
 MIN_CORNER_NOISE_PX = 0.005  # per axis: no detector is better; keeps weights finite where corners are exact
 SPEED_BINS = 12  # bins of image speed, to which the motion blur is fitted
 MIN_CORNERS_IN_BIN = 50  # with these the median variance has a relative error of a fifth
@@ -45,29 +49,34 @@ WIDE_LOSS_FACTOR = 2.5
 class NoiseModel:
     """Noise of the corners of one camera.
 
-    base [px]: standard deviation of the median corner per axis; exposure [s]: blur per image speed; tau (m,) px:
-    standard deviations of the common error, empty if it is not modelled; misfit [px]: RMS error of the lens model.
-    wide_loss: the threshold of the robust loss is `WIDE_LOSS_FACTOR` times the `loss_scale` of the rig file."""
+    base [px]: standard deviation of the median corner per axis; exposure [s]: blur per image speed; tau [px] and jitter
+    [s]: standard deviations of an image's shift and delay, 0 if not modelled; jitter_std [s]: that of `jitter`; rate:
+    correction of a clock whose stamps jitter, relative; misfit [px]: RMS error of the lens model. wide_loss: the
+    threshold of the robust loss is `WIDE_LOSS_FACTOR` times the `loss_scale` of the rig file."""
 
     base: float
     exposure: float = 0.0
-    tau: tuple[float, ...] = ()
+    tau: float = 0.0
     misfit: float = 0.0
     wide_loss: bool = False
+    jitter: float = 0.0
+    jitter_std: float = 0.0
+    rate: float = 0.0
 
     def noise(
-        self, stream: CornerStream, camera: Camera, settings: Settings, speed: np.ndarray | None = None
+        self, stream: CornerStream, settings: Settings, speed: np.ndarray | None = None, flow: np.ndarray | None = None
     ) -> CornerNoise:
-        """The noise of each corner of `stream`. speed (M,) px/s: image speed of each image; no motion blur if None."""
+        """The noise of each corner of `stream`. speed (M,) px/s: image speed of each image; no motion blur if None.
+        flow (N, 2) px/s: image velocity of each corner; no jitter if None."""
         blur = 0.0 if speed is None else self.exposure * speed[stream.image]
         sigma = np.hypot(np.hypot(self.base * stream.relative_sigma, blur), self.misfit)
-        field = np.ones((len(stream.uv), len(self.tau)))
-        if len(self.tau) > 1:
-            half = 0.5 * np.array(camera.resolution)
-            x, y = ((stream.uv - half) / half[0]).T
-            field[:] = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)[:, : len(self.tau)]
+        field, tau = np.zeros((len(stream.uv), 2, 0)), []
+        if self.tau > 0.0:
+            field, tau = np.tile(np.eye(2), (len(stream.uv), 1, 1)), [self.tau] * 2
+        if self.jitter > 0.0 and flow is not None:
+            field, tau = np.concatenate([field, flow[:, :, None]], axis=2), [*tau, self.jitter]
         scale = settings.loss_scale * (WIDE_LOSS_FACTOR if self.wide_loss else 1.0)
-        return CornerNoise(sigma, np.array(self.tau), field, settings.loss, scale)
+        return CornerNoise(sigma, np.array(tau), np.ascontiguousarray(field), settings.loss, scale)
 
 
 def first_noise(camera: Camera) -> NoiseModel:
@@ -75,16 +84,23 @@ def first_noise(camera: Camera) -> NoiseModel:
     return NoiseModel(camera.corner_noise_px or INITIAL_CORNER_NOISE_PX)
 
 
-def image_speed(factor: CornerFactor, state: State) -> np.ndarray:
-    """(M,) px/s: image speed of the target in each image, RMS over the corners in use; 0 without such corners."""
-    square = np.empty(len(factor.stream.uv))
-    for v0, v1 in factor.blocks():
-        square[factor.corners_of(v0, v1)] = _squared_flow(factor, state, v0, v1)
+def image_speed(factor: CornerFactor, flow: np.ndarray) -> np.ndarray:
+    """(M,) px/s: image speed of the target in each image, RMS over the corners in use; 0 without such corners.
+    flow (N, 2) px/s: result of `image_flow`."""
+    square = np.einsum("ni,ni->n", flow, flow)
     return np.sqrt(image_mean(factor.stream, square, factor.keep))
 
 
-def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
-    """(n,) (px/s)^2: squared image speed of each corner of views v0..v1."""
+def image_flow(factor: CornerFactor, state: State) -> np.ndarray:
+    """(N, 2) px/s: image velocity of each corner."""
+    flow = np.empty_like(factor.stream.uv)
+    for v0, v1 in factor.blocks():
+        flow[factor.corners_of(v0, v1)] = _flow(factor, state, v0, v1)
+    return flow
+
+
+def _flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
+    """(n, 2) px/s: image velocity of each corner of views v0..v1."""
     X, _ = factor.points_in_camera(state, v0, v1)
     image = factor.views.image[v0:v1]
     poses = factor.imu_poses(state, int(image[0]), int(image[-1]) + 1)
@@ -94,7 +110,7 @@ def _squared_flow(factor: CornerFactor, state: State, v0: int, v1: int) -> np.nd
     of_corner = np.repeat(image - image[0], np.diff(factor.views.start[v0 : v1 + 1]))
     params = factor.lens(state)
     _, _, J, _ = factor.model.project_with_jacobians(params, X)
-    return (np.einsum("nij,nj->ni", J, -np.cross(rate[of_corner], X) - velocity[of_corner]) ** 2).sum(axis=1)
+    return np.einsum("nij,nj->ni", J, -np.cross(rate[of_corner], X) - velocity[of_corner])
 
 
 def image_mean(stream: CornerStream, x: np.ndarray, keep: np.ndarray) -> np.ndarray:
@@ -142,12 +158,12 @@ def estimate_noise(
     factor: CornerFactor,
     out: CornerOutput,
     speed: np.ndarray,
-    tau: tuple[float, ...],
 ) -> tuple[NoiseModel, bool]:
-    """Noise of the next pass, estimated from the residuals `out`, and whether the misfit of the lens model is large.
+    """Noise of the next pass, estimated from the residuals `out`, without shared errors, and whether the misfit of the
+    lens model is large.
 
-    A base noise in the rig file is kept, with zero misfit. speed (M,) px/s: result of `image_speed`; tau: standard
-    deviations of the common error. Raises EstimationError if the pass diverged, so that no corner is in use.
+    A base noise in the rig file is kept, with zero misfit. speed (M,) px/s: result of `image_speed`. Raises
+    EstimationError if the pass diverged, so that no corner is in use.
     """
     if not (out.root > 0.0).any():
         raise EstimationError(
@@ -157,19 +173,50 @@ def estimate_noise(
         )
     estimate = residual_noise(factor, out, settings, speed)
     if camera.corner_noise_px is not None:
-        return NoiseModel(camera.corner_noise_px, estimate.exposure, tau), estimate.lens_misfit_is_large
-    return NoiseModel(estimate.base, estimate.exposure, tau, estimate.lens.rms), estimate.lens_misfit_is_large
+        return NoiseModel(camera.corner_noise_px, estimate.exposure), estimate.lens_misfit_is_large
+    return NoiseModel(estimate.base, estimate.exposure, misfit=estimate.lens.rms), estimate.lens_misfit_is_large
 
 
-def scale_common_errors(tau: tuple[float, ...], fits: list[Fit]) -> tuple[float, ...]:
-    """tau (m,) px of the next pass: each times the square root of its chi^2 over post-fit degrees of freedom.
+def scale_shift(tau: float, fit: Fit) -> float:
+    """tau [px] of the next pass: times the square root of its chi^2 over post-fit degrees of freedom."""
+    return float(np.clip(tau * np.sqrt(fit.chi2 / max(fit.dof, 1.0)), MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX))
 
-    fits: statistics of the camera's common errors, in the order of `tau`.
+
+def from_middle(stream: CornerStream) -> np.ndarray:
+    """(M,) s: stamps of the images since the mean stamp of their recording."""
+    parts = np.split(stream.seconds, np.searchsorted(stream.stamps_ns, stream.joins_ns))
+    return np.concatenate([part - part.mean() for part in parts if len(part)])
+
+
+def with_jitter(
+    model: NoiseModel, present: NoiseModel, factor: CornerFactor, out: CornerOutput, fit: Fit
+) -> NoiseModel:
+    """`model` with jitter and clock rate, estimated from the delays in the residuals `out` of a pass with the noise
+    `present`. fit: statistics of these delays.
+
+    A line through delays with jitter leaves a rate, to which independent delays would give too much certainty."""
+    image, delay = factor.views.image, out.shared[:, -1]
+    seconds = from_middle(factor.stream)[image]
+    speed = image_speed(factor, factor.noise.field[:, :, -1])[image]
+    line = np.polynomial.Polynomial.fit(seconds, delay, 1, w=speed)
+    chi2 = float((((delay - line(seconds)) / present.jitter) ** 2).sum())
+    jitter, std = scale_jitter(present.jitter, replace(fit, chi2=chi2))
+    return replace(model, jitter=jitter, jitter_std=std, rate=present.rate + float(line.deriv()(0.0)))
+
+
+def scale_jitter(jitter: float, fit: Fit) -> tuple[float, float]:
+    """`jitter` [s] of the next pass, as `scale_shift`, and its standard deviation; zeros if it is not significant.
+
+    Without jitter, the estimated delays are the noise of the estimate alone. With `dof` of the `count` delays observed,
+    their chi^2 is then count q (1 - q) at most, with q = dof / count (Jensen's inequality).
     """
-    return tuple(
-        float(np.clip(t * np.sqrt(f.chi2 / max(f.dof, 1.0)), MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX))
-        for t, f in zip(tau, fits, strict=True)
-    )
+    dof = max(fit.dof, 1.0)
+    share = min(dof / fit.count, 1.0)
+    noise = dof * (1.0 - share) + SIGNIFICANT_JITTER_STD * np.sqrt(2.0 * dof) * (1.0 - share)
+    if fit.chi2 <= noise:
+        return 0.0, 0.0
+    scaled = jitter * float(np.sqrt(fit.chi2 / dof))
+    return scaled, scaled / float(np.sqrt(2.0 * dof))
 
 
 def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:

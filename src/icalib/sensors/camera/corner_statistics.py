@@ -13,16 +13,24 @@ from icalib.optim.arrowhead import in_parallel
 if TYPE_CHECKING:
     from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 
-CORNERS = "corners"  # kind of residual
+CORNERS, SHIFT, DELAY = "corners", "common error", "stamp jitter"  # kinds of residuals
 
 
 def corner_squares(camera: CornerFactor, out: CornerOutput) -> dict[FitKey, Squares]:
     """Number and chi^2 of the corners, and of the coefficients of each common error."""
     squares = {(camera.name, CORNERS): Squares(2 * int(np.count_nonzero(out.root)), camera.chi2(out))}
-    for k, tau in enumerate(camera.noise.tau):
-        rows = out.shared[:, :, k] / tau
-        squares[camera.name, f"common error {k}"] = Squares(rows.size, float((rows**2).sum()))
+    for kind, coefficients in _shared_kinds(camera).items():
+        rows = out.shared[:, coefficients] / camera.noise.tau[coefficients]
+        squares[camera.name, kind] = Squares(rows.size, float((rows**2).sum()))
     return squares
+
+
+def _shared_kinds(camera: CornerFactor) -> dict[str, slice]:
+    """Coefficients of each kind of common error that is modelled: a shift has two, a delay one."""
+    m = len(camera.noise.tau)
+    shifts = m - m % 2
+    kinds = {SHIFT: slice(0, shifts), DELAY: slice(shifts, m)}
+    return {kind: part for kind, part in kinds.items() if part.start < part.stop}
 
 
 def image_rows(
@@ -58,15 +66,15 @@ def _dof_used_by_views(
     along = (up - down) / step.share * root[:, None]
     if m == 0:
         return {CORNERS: float((along**2).sum())}
-    # The common error c minimises |along + f c|^2 + |c / tau|^2; its covariance about the minimum is M^-1, per axis.
-    f = camera.noise.field[rows] * root[:, None]
-    M, rhs = np.zeros((n, m, m)), np.zeros((n, m, 2))
-    np.add.at(M, view, f[:, :, None] * f[:, None, :])
-    np.add.at(rhs, view, -f[:, :, None] * along[:, None, :])
+    # The common error c minimises |along + f c|^2 + |c / tau|^2; its covariance about the minimum is M^-1.
+    f = camera.noise.field[rows] * root[:, None, None]
+    M, rhs = np.zeros((n, m, m)), np.zeros((n, m))
+    np.add.at(M, view, np.einsum("iak,ial->ikl", f, f))
+    np.add.at(rhs, view, -np.einsum("iak,ia->ik", f, along))
     M += np.diag(1.0 / camera.noise.tau**2)
     inverse = np.linalg.inv(M)
-    shared = inverse @ rhs
-    total = float(((along + np.einsum("ik,ikj->ij", f, shared[view])) ** 2).sum())
-    total += 2.0 * float(np.einsum("ik,ikl,il->", f, inverse[view], f))
-    spent = ((shared**2).sum(axis=2) + 2.0 * np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=0) / camera.noise.tau**2
-    return {CORNERS: total} | {f"common error {k}": float(spent[k]) for k in range(m)}
+    shared = np.einsum("vkl,vl->vk", inverse, rhs)
+    total = float(((along + np.einsum("iak,ik->ia", f, shared[view])) ** 2).sum())
+    total += float(np.einsum("iak,ikl,ial->", f, inverse[view], f))
+    spent = (shared**2 + np.diagonal(inverse, axis1=1, axis2=2)).sum(axis=0) / camera.noise.tau**2
+    return {CORNERS: total} | {kind: float(spent[part].sum()) for kind, part in _shared_kinds(camera).items()}

@@ -23,15 +23,19 @@ from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_noise import (
     INITIAL_COMMON_ERROR_PX,
-    N_COMMON_ERRORS,
+    MAX_INITIAL_JITTER_S,
+    WIDE_JITTER,
     NoiseModel,
     estimate_noise,
     first_noise,
+    from_middle,
+    image_flow,
     image_speed,
-    scale_common_errors,
+    scale_shift,
+    with_jitter,
 )
 from icalib.sensors.camera.corner_outliers import inliers
-from icalib.sensors.camera.corner_statistics import CORNERS
+from icalib.sensors.camera.corner_statistics import CORNERS, DELAY, SHIFT
 from icalib.sensors.camera.edge_curvature import with_bent_edges
 from icalib.sensors.camera.features.error_clusters import error_clusters
 from icalib.sensors.camera.features.patch_curvature import with_curved_patches
@@ -112,7 +116,7 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
             model, keep = first_noise(camera), np.ones(len(stream.uv), dtype=bool)
             selection = TrackSelection.first(camera, tracks[camera.name]) if tracks else None
             late = np.zeros(len(stream.stamps_ns), dtype=bool)
-            noise[camera.name] = CameraNoise(model, model.noise(stream, camera, rig.settings), keep, late, selection)
+            noise[camera.name] = CameraNoise(model, model.noise(stream, rig.settings), keep, late, selection)
         return noise
 
     def next_noises(
@@ -128,7 +132,7 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
             keep = inliers(factor, out, settings) & ~apart[factor.stream.image]
             next_noise[camera.name] = replace(next_noise[camera.name], keep=keep, late=apart)
             if estimated:
-                model, corners = _next_corner_noise(camera, factor, out, end)
+                model, corners = _next_corner_noise(camera, noise[camera.name].model, factor, out, end)
                 next_noise[camera.name] = replace(next_noise[camera.name], model=model, corners=corners)
         return next_noise
 
@@ -140,7 +144,8 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         estimated = _noise_is_estimated(sensors, measurements.cameras, tracked, settings)
         if not (estimated or (tracked and settings.outlier_std > 0.0)):
             return 0
-        return 2 if settings.common_error else 1
+        uneven = rig.imu is not None and any(s.jitter_s > 0.0 for s in measurements.cameras)
+        return 2 if settings.common_error or uneven else 1
 
     def factors(self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> Iterator[CornerFactor]:
         """Yields the corner factor of the camera, which may have no corners."""
@@ -191,12 +196,13 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
     Early (coarse) passes leave out the corrections of circle centres and edge curvature, which need a good lens."""
     rig, state, imu = at.rig, at.state, at.imu
     scheme = rig.settings.scheme if imu is not None else "inertial"
-    times, images = instants(stream, state.values), [part.rows[camera.name] for part in at.parts]
+    seconds = stream.seconds + noise.model.rate * from_middle(stream)
+    times, images = instants(stream, state.values, seconds), [part.rows[camera.name] for part in at.parts]
     keyframe = keyframes_of(scheme, state, times, images, imu)
     used = are_used(imu, times, state.seconds[keyframe], rig.settings.max_gap_s)
     gravity = 0.0 if at.motion is None else at.motion.gravity  # no effect without an IMU
     factor = CornerFactor(
-        stream, camera_model(camera.model), imu, gravity, scheme, stream.seconds, keyframe,
+        stream, camera_model(camera.model), imu, gravity, scheme, seconds, keyframe,
         noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
         len(state.seconds), tuple(recording_images.start for recording_images in images[1:]),
     )  # fmt: skip
@@ -263,23 +269,28 @@ def _next_tracks(cameras: Sequence[Camera], noise: Mapping[str, CameraNoise], en
 
 
 def _next_corner_noise(
-    camera: Camera, factor: CornerFactor, out: CornerOutput, end: PassEnd
+    camera: Camera, present: NoiseModel, factor: CornerFactor, out: CornerOutput, end: PassEnd
 ) -> tuple[NoiseModel, CornerNoise]:
-    """The corner noise of the next pass, estimated from the residuals `out` of this pass: its model, and the noise of
-    each corner. Unchanged if the camera sees no target."""
+    """The corner noise of the next pass, estimated from the residuals `out` of this pass with the noise `present`: its
+    model, and the noise of each corner. Unchanged if the camera sees no target."""
     settings = end.rig.settings
     if not factor.sees_target:
         return first_noise(camera), factor.noise
-    speed = image_speed(factor, end.state)
-    # tau: standard deviations of the error that all corners of an image have in common
-    tau = (INITIAL_COMMON_ERROR_PX,) * N_COMMON_ERRORS if settings.common_error else ()
-    if len(factor.noise.tau):
-        common = [f for kind, f in end.of(camera.name).fits.items() if kind.startswith("common")]
-        tau = scale_common_errors(tuple(factor.noise.tau), common)
-    model, large = estimate_noise(camera, settings, factor, out, speed, tau)
+    flow = image_flow(factor, end.state)
+    speed = image_speed(factor, flow)
+    model, large = estimate_noise(camera, settings, factor, out, speed)
+    model = replace(model, rate=present.rate)
+    fits = end.of(camera.name).fits if len(factor.noise.tau) else {}
+    if settings.common_error:
+        tau = scale_shift(present.tau, fits[SHIFT]) if present.tau else INITIAL_COMMON_ERROR_PX
+        model = replace(model, tau=tau)
+    if end.is_first and end.rig.imu is not None:
+        model = replace(model, jitter=min(WIDE_JITTER * factor.stream.jitter_s, MAX_INITIAL_JITTER_S))
+    elif present.jitter > 0.0 and len(factor.noise.tau) % 2:
+        model = with_jitter(model, present, factor, out, fits[DELAY])
     # A large misfit of the lens model makes good corners look like outliers.
     model = replace(model, wide_loss=large and end.rig.cameras_alone)
-    return model, model.noise(factor.stream, camera, settings, speed)
+    return model, model.noise(factor.stream, settings, speed, flow)
 
 
 def _noise_is_estimated(

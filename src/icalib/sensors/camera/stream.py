@@ -16,10 +16,12 @@ NO_VIEWS = np.zeros(0, dtype=np.int64)
 
 @dataclass(frozen=True)
 class _ImageStream(Stream):
-    """Observations in M images. start (M + 1,): the rows of image i are start[i]:start[i + 1]."""
+    """Observations in M images. start (M + 1,): the rows of image i are start[i]:start[i + 1]. jitter_s: rough standard
+    deviation of the stamps' errors, 0 if stamps are true."""
 
     sensor_type: ClassVar[str] = "camera"
     start: np.ndarray
+    jitter_s: float = field(default=0.0, kw_only=True)
 
     @property
     def image(self) -> np.ndarray:
@@ -65,13 +67,16 @@ class CornerStream(_ImageStream):
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         sigma, edges = (x[rows] if len(x) else x for x in (self.sigma, self.edges))
         point, uv, files = self.point[rows], self.uv[rows], self.files
-        return CornerStream(self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, files=files)
+        return CornerStream(
+            self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, files=files, jitter_s=self.jitter_s
+        )
 
     @classmethod
     def joined(cls, streams: Sequence[Any], shifts_ns: Sequence[int] | None = None) -> Self:
         parts = zip(streams, shifts_ns or [0] * len(streams), strict=True)
         files = {stamp + shift: file for stream, shift in parts for stamp, file in stream.files.items()}
-        return replace(super().joined(streams, shifts_ns), files=files)
+        jitter_s = max(stream.jitter_s for stream in streams)
+        return replace(super().joined(streams, shifts_ns), files=files, jitter_s=jitter_s)
 
     def which(self, stamp_ns: int) -> str:
         """Text that names the image with this stamp in messages: its file, or else its stamp."""

@@ -24,7 +24,7 @@ from icalib.optim.state import State
 from icalib.rig import Settings
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
-from icalib.sensors.camera.corner_noise import image_speed, residual_noise
+from icalib.sensors.camera.corner_noise import image_flow, image_speed, residual_noise
 from icalib.sensors.camera.corner_outliers import rejected
 
 MOST_IMAGES = 40  # images of a comparison, half of them for the test; the computing time is proportional
@@ -80,7 +80,8 @@ def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
     for camera, (factor, out), stream in zip(inputs.rig.cameras, pairs, streams, strict=True):
         if camera.distortion.mode == "fixed" or not (out.root > 0.0).any():
             continue
-        noise = residual_noise(factor, out, inputs.rig.settings, image_speed(factor, state))
+        speed = image_speed(factor, image_flow(factor, state))
+        noise = residual_noise(factor, out, inputs.rig.settings, speed)
         if not noise.lens_misfit_is_large:
             continue
         gain = 2.0 * float(np.count_nonzero(out.root)) * (noise.lens.rms / noise.base) ** 2

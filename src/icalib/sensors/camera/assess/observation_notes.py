@@ -56,6 +56,17 @@ def _corner_notes(
     if not len(factor.stream.uv):
         return
     yield f"{camera.name}: {_noise_words(model)}."
+    if model.rate:
+        yield (
+            f"the clock of {camera.name}, whose stamps jitter, is corrected by {1e6 * model.rate:+.0f} ppm, by the "
+            "other sensors."
+        )
+    if model.jitter_std > 0.0:
+        yield (
+            f"the stamps of {camera.name} jitter by {1e3 * model.jitter:.2g} +- {1e3 * model.jitter_std:.1g} ms "
+            "(standard deviation), by the residuals along the image velocity; the standard deviations take it into "
+            "account. Let the camera stamp its images for a better result."
+        )
     if words := _rejected_words(factor.keep[~late[factor.stream.image]]):
         yield f"{camera.name}: {words}"
     if factor.bodies.target.radii.any():
@@ -109,8 +120,8 @@ def _noise_words(model: NoiseModel) -> str:
         words += f", {model.misfit:.2g} px that the lens model does not follow"
     if model.exposure > 0.0:
         words += f", {1e3 * model.exposure:.2f} px of motion blur at 1000 px/s of image speed"
-    if model.tau:
-        words += f", {' and '.join(f'{t:.3f}' for t in model.tau)} px common to an image"
+    if model.tau > 0.0:
+        words += f", {model.tau:.3f} px common to an image"
     return words
 
 

@@ -18,6 +18,7 @@ from icalib.rig import Rig
 from icalib.sensors.camera.read.checks import checked_corners
 from icalib.sensors.camera.read.corners import CORNER_TABLE, CornerRows, group_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
+from icalib.sensors.camera.read.even_images import with_even_stamps
 from icalib.sensors.camera.read.image_tracks import find_all_tracks
 from icalib.sensors.camera.read.images import image_topic
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
@@ -58,10 +59,15 @@ TABLES = (
 
 
 def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> list[ReadStream]:
-    """Streams of feature tracks, then of corners, each with notes, from tables or images of the cameras.
+    """Streams of feature tracks, then of corners, each with notes, from tables or images of the cameras. Beside other
+    sensors, images get even stamps, see `with_even_stamps`.
 
     Raises RecordingError if data are missing or cannot be read, or if two cameras share an image topic."""
-    return _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
+    streams = _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
+    if reading.rig.cameras_alone:
+        return streams
+    names = {stream.name for stream, _ in streams}
+    return with_even_stamps(streams, {c.name: f"{where(recording, c)} ({c.name})" for c in sensors if c.name in names})
 
 
 def where(recording: Recording, camera: Camera) -> str:

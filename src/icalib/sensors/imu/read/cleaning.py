@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from icalib.data.measurements import ImuStream
+from icalib.data.stamps.even import even_stamps, followed
 from icalib.sensors.imu.read.copies import copies, new_values
-from icalib.sensors.imu.read.even_stamps import EvenStamps, even_stamps
 from icalib.sensors.imu.read.spikes import impossible, spikes, stuck
 
 _BEYOND = 1e12  # larger readings are invalid in any unit; squares of smaller ones do not overflow
@@ -36,9 +38,10 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
         imu = _some(ordered, ~again)
     if (np.diff(imu.stamps_ns) >= 0).all():
         imu = _without_repeats(imu, notes)
-        values = np.hstack([imu.gyro, imu.accel])
-        if (even := even_stamps(imu.stamps_ns, values)) is not None:
-            notes.sentences += (_even_note(what, even),)
+        values, n = np.hstack([imu.gyro, imu.accel]), len(imu.stamps_ns)
+        rows = {"series": np.zeros(n), "at": np.arange(n), "values": values}
+        if (even := even_stamps(imu.stamps_ns, partial(followed, **rows))) is not None:
+            notes.sentences += (even.note(what, "readings"),)
             imu = ImuStream(imu.name, even.stamps_ns, imu.gyro, imu.accel)
     return imu, notes.sentences
 
@@ -103,12 +106,3 @@ def _some(imu: ImuStream, which: np.ndarray) -> ImuStream:
 
 def _interpolated(seconds: np.ndarray, values: np.ndarray, new: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(seconds, seconds[new], values[new, k]) for k in range(3)], axis=1)
-
-
-def _even_note(what: str, even: EvenStamps) -> str:
-    how = f"come in bursts of {even.burst}" if even.burst > 1 else "are uneven"
-    return (
-        f"{what}: the stamps {how}, up to {even.latest_s * 1e3:.3g} ms late, although the readings are evenly "
-        f"spaced. They were replaced by stamps {even.period_ns * 1e-6:.4g} ms apart, fitted to the earliest "
-        "ones; let the driver stamp each reading."
-    )
