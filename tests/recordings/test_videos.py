@@ -97,6 +97,24 @@ def test_a_table_that_holds_no_stamps_is_named_when_it_is_read(tmp_path, table, 
         list(recording.payloads("cam0.mp4"))
 
 
+def test_a_table_of_another_name_is_found_by_its_number_of_rows(tmp_path):
+    """Beside tables of other lengths, of another video, and without order."""
+    write_video(tmp_path / "cam0.mp4")
+    write_video(tmp_path / "cam1.mp4")
+    times(tmp_path / "cam1.csv", FRAMES)
+    times(tmp_path / "short.csv", FRAMES - 1)
+    (tmp_path / "sizes.txt").write_text("".join(f"{(7 * k) % 12}\n" for k in range(FRAMES)))
+    stamps = 7 + times(tmp_path / "frames.csv", FRAMES, "#time [ns],frame\n")
+    (tmp_path / "frames.csv").write_text("time_ns\n" + "\n".join(map(str, stamps.tolist())))
+    recording = open_recording(tmp_path)
+    assert [p.stamp_ns for p in recording.payloads("cam0.mp4")] == stamps.tolist()
+    assert any("its frames have the stamps of frames.csv" in note for note in recording.notes())
+    assert set(recording.files()) == {tmp_path / "cam0.mp4", tmp_path / "frames.csv"}
+    times(tmp_path / "again.csv", FRAMES)
+    with pytest.raises(RecordingError, match=r"again\.csv and frames\.csv both have .* rename the right one to cam0\.csv"):
+        list(open_recording(tmp_path).payloads("cam0.mp4"))
+
+
 def test_the_header_names_the_column_of_the_stamps(tmp_path):
     write_video(tmp_path / "cam0.mp4")
     rows = "".join(f"{k},{ORIGIN_NS + 50_000_000 * k}\n" for k in range(FRAMES))

@@ -20,6 +20,7 @@ from icalib.errors import RecordingError
 
 _TABLES = (".csv", ".txt")
 _STAMP = re.compile(r"[0-9]+(\.[0-9]*)?")
+_MAX_HEADER_LINES = 20  # of a table of stamps
 _TIME = re.compile(r"time|stamp|^t$|^t[_ ]?\[?(ns|us|ms|s)\]?$", re.IGNORECASE)
 
 
@@ -45,12 +46,47 @@ def video_topic(path: Path, name: str) -> TopicInfo:
 
 
 def frame_times(path: Path) -> np.ndarray | None:
-    """(N,) int64 ns: stamps of frames from the table beside the video (`cam0.csv` or `cam0.txt` of `cam0.mp4`); None
-    without a table. The column is the one whose header is a time or stamp, or else the first. Raises RecordingError
-    naming the line."""
-    table = next((p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()), None)
-    if table is None:
+    """(N,) int64 ns: stamps of frames from the `stamp_table` of the video; None without one. The column is the one whose
+    header is a time or stamp, or else the first. Raises RecordingError naming the line."""
+    table = stamp_table(path)
+    return None if table is None else _stamps_in(table, path.name)
+
+
+def stamp_table(path: Path) -> Path | None:
+    """The table beside the video with the stamps of its frames: `cam0.csv` or `cam0.txt` of `cam0.mp4`, or else the only
+    table with as many increasing stamps as the video has frames; None without one. Raises RecordingError if there are
+    several."""
+    if named := [p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()]:
+        return named[0]
+    others = {p.stem for p in videos_in(path.parent)}
+    tables = sorted(p for ending in _TABLES for p in path.parent.glob(f"*{ending}") if p.stem not in others)
+    if not tables:
         return None
+    with _opened(path) as video:
+        frames = int(video.get(_property("FRAME_COUNT")))
+    found = [table for table in tables if _has_stamps(table, path.name, frames)]
+    if len(found) > 1:
+        raise RecordingError(
+            f"{path}: {' and '.join(p.name for p in found)} both have a stamp for each of its {frames} frames; rename "
+            f"the right one to {path.stem}{found[0].suffix}."
+        )
+    return found[0] if found else None
+
+
+def _has_stamps(table: Path, video: str, count: int) -> bool:
+    """Whether the table has `count` increasing stamps."""
+    lines = table.read_bytes().count(b"\n")
+    if not 0 <= lines + 1 - count <= _MAX_HEADER_LINES:
+        return False
+    try:
+        stamps_ns = _stamps_in(table, video)
+    except RecordingError:
+        return False
+    return len(stamps_ns) == count and bool((np.diff(stamps_ns) > 0).all())
+
+
+def _stamps_in(table: Path, video: str) -> np.ndarray:
+    """(N,) int64 ns: stamps in the table of the file name `video`, see `frame_times`."""
     texts, column = [], 0
     for number, line in enumerate(table.read_text(encoding="utf-8-sig", errors="replace").splitlines(), 1):
         cells = [cell.strip() for cell in re.split(r"[,;\t]\s*|\s+", line.strip().lstrip("#"))]
@@ -63,7 +99,7 @@ def frame_times(path: Path) -> np.ndarray | None:
             raise RecordingError(f"{table}:{number}: {line.strip()[:60]!r} has no stamp; correct the line.")
         texts.append(cells[column])
     if not texts:
-        raise RecordingError(f"{table} holds no stamps; write one line for each frame of {path.name}, or remove it.")
+        raise RecordingError(f"{table} holds no stamps; write one line for each frame of {video}, or remove it.")
     if len(texts) > 2 and texts in ([str(k + first) for k in range(len(texts))] for first in (0, 1)):
         raise RecordingError(
             f"{table} counts frames and has no stamps; write stamps in its first column, or remove it."

@@ -13,7 +13,7 @@ from icalib.data.images.euroc_images import file_payloads, image_files
 from icalib.data.images.image_checks import Note, checked_payloads, ignore
 from icalib.data.images.images import Payload
 from icalib.data.images.unreadable import VIDEO_FILE
-from icalib.data.images.videos import video_payloads, video_stamps, video_topic, videos_in
+from icalib.data.images.videos import stamp_table, video_payloads, video_stamps, video_topic, videos_in
 from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window
 from icalib.data.tables.files import StampsOfRows, TableFile, files_in, named_tables, rows_of
@@ -91,6 +91,10 @@ class FolderRecording(Recording):
     def _frames(self, video: Path) -> Iterator[Payload]:
         """Checked frames of a video in the time window."""
         self._remember(video)
+        if (table := stamp_table(video)) is not None:
+            self._remember(table)
+            if table.stem != video.stem:
+                self.note(f"{video}: its frames have the stamps of {table.name}, a table with as many rows.")
         frames = video_payloads(video, str(video))
         if not self.window.is_all:
             stamps_ns = video_stamps(video)
