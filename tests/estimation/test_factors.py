@@ -205,11 +205,11 @@ def corner_sample(
         bend = np.sqrt(slope_along(loss if curved else "none", size / sigma[used]))
         B = np.eye(2) + (bend - 1.0)[:, None, None] * np.einsum("ni,nj->nij", e, e) / (size**2)[:, None, None]
         B = np.block([[np.diag(root * B[:, i, j]) for j in range(2)] for i in range(2)])
-        W = np.eye(2 * len(r))
+        W = B @ B
         for i in range(len(factor.views.image) if field else 0):
-            F = np.concatenate([root[:, None] * f[:, axis] * (view == i)[:, None] for axis in range(2)])
-            W -= F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T)
-        return (root[:, None] ** 2 * e).T.ravel(), B @ W @ B
+            F = B @ np.concatenate([f[:, axis] * (view == i)[:, None] for axis in range(2)])
+            W -= B @ F @ np.linalg.solve(F.T @ F + np.diag(noise.tau**-2), F.T @ B)
+        return (root[:, None] ** 2 * e).T.ravel(), W
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(np.float64), sums, curved)

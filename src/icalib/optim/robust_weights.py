@@ -138,33 +138,53 @@ def correct_curvature(A, D, i, n, r, factor):
         A[k, n + i] += change * v
 
 
-@njit(cache=True, nogil=True, inline="always")
-def marginalise_shared(A, D, n, root, f, precision, G):
-    """Subtracts the Schur complement of the image's common error from the Gram matrix G (D + 1, D + 1). A: as in
-    `correct_curvature`.
-
-    The gradient by the common error is zero, because the cost is minimal over it.
-    """
-    m = f.shape[2]
+@njit(cache=True, nogil=True)
+def _elimination(A, D, n, F, precision, C, K):
+    """Fills C (m, D): information of the common error of an image with the D parameters, and K (m, D): that times the
+    covariance of the common error. Other arguments as in `marginalise_shared`."""
+    m = len(precision)
     M, inv = np.empty((m, m)), np.empty((m, m))
-    C = np.empty((m, D))
     for a in range(m):
         for b in range(m):
             M[a, b] = precision[a] if a == b else 0.0
+            for i in range(2 * n):
+                M[a, b] += F[a, i] * F[b, i]
         for k in range(D):
-            C[a, k] = 0.0
-    for axis in range(2):
-        for i in range(n):
-            for a in range(m):
-                wf = root[i] * f[i, axis, a]
-                for b in range(m):
-                    M[a, b] += wf * root[i] * f[i, axis, b]
-                for k in range(D):
-                    C[a, k] += wf * A[k, axis * n + i]
+            C[a, k], K[a, k] = 0.0, 0.0
+            for i in range(2 * n):
+                C[a, k] += F[a, i] * A[k, i]
     _invert_small(M, inv)
     for a in range(m):
         for b in range(m):
             for k in range(D):
-                s = inv[a, b] * C[a, k]
-                for c in range(D):
-                    G[k, c] -= s * C[b, c]
+                K[a, k] += inv[a, b] * C[b, k]
+
+
+@njit(cache=True, nogil=True)
+def marginalise_shared(A, D, n, F, precision, G):
+    """Subtracts the Schur complement of the image's common error from the Gram matrix G (D + 1, D + 1). A (D + 1, 2 n):
+    as in `correct_curvature`; F (m + 1, 2 n): the same with the columns of the common error.
+
+    The gradient by the common error is zero, because the cost is minimal over it.
+    """
+    m = len(precision)
+    C, K = np.empty((m, D)), np.empty((m, D))
+    _elimination(A, D, n, F, precision, C, K)
+    for a in range(m):
+        for k in range(D):
+            for c in range(D):
+                G[k, c] -= K[a, k] * C[a, c]
+
+
+@njit(cache=True, nogil=True)
+def marginalise_gradients(A, D, n, F, precision, cluster, G):
+    """Subtracts from gradients G (D, clusters) what each cluster of corners pulls the image's common error by. cluster
+    (n,): index of each corner's cluster; other arguments as in `marginalise_shared`."""
+    m = len(precision)
+    C, K = np.empty((m, D)), np.empty((m, D))
+    _elimination(A, D, n, F, precision, C, K)
+    for a in range(m):
+        for i in range(n):
+            pull = F[a, i] * F[m, i] + F[a, n + i] * F[m, n + i]
+            for k in range(D):
+                G[k, cluster[i]] -= K[a, k] * pull

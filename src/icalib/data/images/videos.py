@@ -46,16 +46,16 @@ def video_topic(path: Path, name: str) -> TopicInfo:
 
 
 def frame_times(path: Path) -> np.ndarray | None:
-    """(N,) int64 ns: stamps of frames from the `stamp_table` of the video; None without one. The column is the one whose
-    header is a time or stamp, or else the first. Raises RecordingError naming the line."""
+    """(N,) int64 ns: stamps of frames from the `stamp_table` of the video; None without one. The column is the one
+    whose header is a time or stamp, or else the first. Raises RecordingError naming the line."""
     table = stamp_table(path)
     return None if table is None else _stamps_in(table, path.name)
 
 
 def stamp_table(path: Path) -> Path | None:
-    """The table beside the video with the stamps of its frames: `cam0.csv` or `cam0.txt` of `cam0.mp4`, or else the only
-    table with as many increasing stamps as the video has frames; None without one. Raises RecordingError if there are
-    several."""
+    """The table beside the video with the stamps of its frames: `cam0.csv` or `cam0.txt` of `cam0.mp4`, or else the
+    only table with as many increasing stamps as the video has frames; None without one. Raises RecordingError if there
+    are several."""
     if named := [p for ending in _TABLES if (p := path.with_suffix(ending)).is_file()]:
         return named[0]
     others = {p.stem for p in videos_in(path.parent)}

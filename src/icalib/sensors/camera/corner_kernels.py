@@ -12,7 +12,14 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.sensor_pose import SensorPose, chain_width, fill_chain
-from icalib.optim.robust_weights import add_common_error, correct_curvature, marginalise_shared, robust_weights, weight
+from icalib.optim.robust_weights import (
+    add_common_error,
+    correct_curvature,
+    marginalise_gradients,
+    marginalise_shared,
+    robust_weights,
+    weight,
+)
 from icalib.optim.rows import add_gradients, add_gram
 
 
@@ -167,10 +174,12 @@ def _recall_view(i, corners, kept, residual, root):
 
 
 @njit(cache=True, nogil=True)
-def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_rows):
-    """Writes the transposed weighted Jacobian of view i into J_rows (D + 1, 2 n).
+def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_rows, J_shared):
+    """Writes the transposed weighted Jacobian of view i into J_rows (D + 1, 2 n), and that by the common error into
+    J_shared (m + 1, 2 n).
 
-    Its rows: camera pose (6), free model parameters, bloom, shape and size of the body; last, the weighted error."""
+    Rows: camera pose (6), free model parameters, bloom, shape and size of the body; last, in both, the weighted error.
+    """
     n0, n = corners.start[i], corners.start[i + 1] - corners.start[i]
     ns, n_pars, has_bloom = direct.basis.shape[1], len(direct.pars), len(direct.direction) > 0
     D = 6 + n_pars + has_bloom + ns
@@ -199,8 +208,12 @@ def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_row
             for q in range(ns):
                 J_rows[d + q, at] = w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
             J_rows[D, at] = root * error[k, r]
+            for q in range(len(noise.precision)):
+                J_shared[q, at] = root * noise.field[n0 + k, r, q]
+            J_shared[len(noise.precision), at] = root * error[k, r]
     if noise.curved and noise.loss > 0:
         _bend_rows(n0, n, noise, roots, error, D, J_rows)
+        _bend_rows(n0, n, noise, roots, error, len(noise.precision), J_shared)
 
 
 @njit(cache=True, nogil=True)
@@ -220,11 +233,12 @@ def _bend_rows(n0, n, noise, roots, error, D, J_rows):
 class _Workspace(NamedTuple):
     """Reused arrays for one view of at most n corners.
 
-    J_rows (D + 1, 2 n): weighted Jacobian, see `_fill_rows`; G (D + 1, D + 1): its Gram matrix; residual (n, 2) px,
-    error (n, 2) px: with the common error; root (n,) 1/px. J_imu (6, 6), J_chain (6, w): Jacobians of the camera pose
-    by the IMU pose, and by keyframes and calibration parameters; F: see `add_gram`."""
+    J_rows (D + 1, 2 n), J_shared (m + 1, 2 n): weighted Jacobians, see `_fill_rows`; G (D + 1, D + 1): Gram matrix of
+    J_rows; residual (n, 2) px, error (n, 2) px: with the common error; root (n,) 1/px. J_imu (6, 6), J_chain (6, w):
+    Jacobians of the camera pose by the IMU pose, and by keyframes and calibration parameters; F: see `add_gram`."""
 
     J_rows: np.ndarray
+    J_shared: np.ndarray
     G: np.ndarray
     residual: np.ndarray
     error: np.ndarray
@@ -235,7 +249,7 @@ class _Workspace(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _workspace(corners, direct, poses):
+def _workspace(corners, noise, direct, poses):
     """A `_Workspace` for the view with most corners."""
     most = 0
     for i in range(len(corners.start) - 1):
@@ -243,7 +257,8 @@ def _workspace(corners, direct, poses):
     n_d = len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
     width, D = chain_width(poses.camera) + poses.columns.shape[1], 6 + n_d
     return _Workspace(
-        np.empty((D + 1, 2 * most)), np.empty((D + 1, D + 1)), np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
+        np.empty((D + 1, 2 * most)), np.empty((len(noise.precision) + 1, 2 * most)), np.empty((D + 1, D + 1)),
+        np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
         np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1)),
     )  # fmt: skip
 
@@ -286,7 +301,7 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
 
     Adds their normal equations to `sums`, unless its arrays are empty. Returns half the robust chi^2.
     """
-    work, total = _workspace(corners, direct, poses), 0.0
+    work, total = _workspace(corners, noise, direct, poses), 0.0
     J_rows, G, J_chain, D, n_chain = work.J_rows, work.G, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
     for i in range(i0, i1):
         n0, n1 = corners.start[i], corners.start[i + 1]
@@ -296,10 +311,10 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
         if len(sums.diagonal) == 0:
             continue
         add_common_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
-        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
+        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows, work.J_shared)
         _gram(J_rows, D + 1, 2 * n, G)
         if len(noise.precision):
-            marginalise_shared(J_rows, D, n, root, noise.field[n0:n1], noise.precision, G)
+            marginalise_shared(J_rows, D, n, work.J_shared, noise.precision, G)
         _fill_chain(i, poses, work.J_imu, J_chain)
         add_gram(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], work.F, sums)
     return total
@@ -310,7 +325,7 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, dir
     """Adds the gradient of each cluster of corners in views i0..i1 to the columns from `column` on of `sums`.
 
     cluster (N,): index of each corner's cluster, from 0 to n_clusters - 1. kept: residuals and weights to use."""
-    work = _workspace(corners, direct, poses)
+    work = _workspace(corners, noise, direct, poses)
     J_rows, J_chain, D, n_chain = work.J_rows, work.J_chain, len(work.G) - 1, chain_width(poses.camera)
     G = np.empty((D, n_clusters))
     for i in range(i0, i1):
@@ -319,11 +334,13 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, dir
         residual, root = work.residual[:n], work.root[:n]
         _recall_view(i, corners, kept, residual, root)
         add_common_error(residual, noise.field[n0:n1], kept.shared[i], work.error)
-        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows)
+        _fill_rows(i, corners, noise, direct, poses, projection, root, work.error, J_rows, work.J_shared)
         for d in range(D):
             for g in range(n_clusters):
                 G[d, g] = 0.0
             for k in range(n):
                 G[d, cluster[n0 + k]] += J_rows[d, k] * J_rows[D, k] + J_rows[d, n + k] * J_rows[D, n + k]
+        if len(noise.precision):
+            marginalise_gradients(J_rows, D, n, work.J_shared, noise.precision, cluster[n0:n1], G)
         _fill_chain(i, poses, work.J_imu, J_chain)
         add_gradients(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], column, sums)
