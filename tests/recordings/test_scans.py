@@ -170,6 +170,31 @@ def test_a_scan_stamped_too_early_or_too_late_is_left_out(tmp_path, jitter_ns, l
     assert "1 of 24 scans are stamped more than 5% of a period too early or too late relative to" in notes[0]
 
 
+@pytest.mark.parametrize("kind", ["late", "lost", "cut at packets"])
+def test_stamps_of_arrival_are_made_even_and_those_of_scans_that_differ_in_length_are_not(tmp_path, kind):
+    """Scans that begin with a packet are as long as the time to the next one, so their stamps are true."""
+    rng = np.random.default_rng(1)
+    number = np.delete(np.arange(200), [20, 70, 71, 120] if kind == "lost" else [])
+    n = len(number)
+    true = 10**18 + 10**8 * number
+    arrays: dict[str, Any] = {"stamps_ns": true.copy(), "start": 10 * np.arange(n + 1)}
+    arrays["offset_s"] = np.tile(MANY["offset_s"][:10], n)
+    arrays["xyz"] = rng.uniform(1, 9, (10 * n, 3)).astype(np.float32)
+    if kind == "cut at packets":
+        early = rng.integers(0, 3, n) * 1_300_000
+        arrays["stamps_ns"] = true - early
+        longer = np.repeat(np.diff(early, append=early[-1]) * -1e-8, 10)
+        arrays["offset_s"] = (arrays["offset_s"] * (1.0 + longer)).astype(np.float32)
+    else:
+        arrays["stamps_ns"] = true + rng.exponential(3e6, len(true)).astype(np.int64)
+    stream, notes = read(tmp_path, arrays)
+    if kind == "cut at packets":
+        assert stream.stamps_ns.tolist() == arrays["stamps_ns"].tolist() and notes == ()
+    else:
+        assert np.ptp(stream.stamps_ns - true) < 2e5
+        assert "the stamps jitter by" in notes[0] and "made even at 10.00 Hz" in notes[0]
+
+
 @pytest.mark.parametrize("case", ["jitter", "lost", "sector", "uneven"])
 def test_stamps_that_are_no_faults(tmp_path, case):
     """Stamps of a driver that jitters; lost scans; a sector without returns, where a clock of the points begins later;

@@ -7,7 +7,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.data.stamps.clocks import rate_sentence
 from icalib.errors import RecordingError
-from icalib.sensors.lidar.read.scan_order import at_even_steps, in_order, selected, without_repeats
+from icalib.sensors.lidar.read.scan_order import at_even_steps, in_order, selected, with_even_stamps, without_repeats
 
 _SCAN_RATE_HZ = (0.1, 1000.0)  # lowest and highest plausible rate
 _MAX_POINT_PERIODS = 2.0  # time from the stamp of a scan to its points, in scan periods
@@ -88,7 +88,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
         notes = (f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out.",)
         start = np.append(stream.start[:-1][filled], stream.start[-1])
         stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
-    for check in (without_repeats, in_order, at_even_steps):
+    for check in (without_repeats, in_order, with_even_stamps, at_even_steps):
         stream, more = check(stream, what)
         notes += more
     if len(stream.stamps_ns) < 2:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from icalib.data.measurements import LidarStream
+from icalib.data.stamps.even import even_stamps
 from icalib.errors import RecordingError
 
 _N_RECENT_SCANS = 4  # among which a copy is searched; messages overtake only a few others
@@ -67,6 +69,25 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
             f"and were removed, the first at {stamps_ns[bad[0]]} ns.",
         )
     return selected(stream, order), notes
+
+
+def with_even_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """The stream with even stamps if a computer stamps scans on arrival that the LiDAR takes evenly, and a note."""
+    if (even := even_stamps(stream.stamps_ns, partial(_spans_follow, stream))) is None:
+        return stream, ()
+    return replace(stream, stamps_ns=even.stamps_ns), (even.note(what, "scans"),)
+
+
+def _spans_follow(stream: LidarStream, number: np.ndarray, delay: np.ndarray) -> tuple[float, float]:
+    """See `Follows`: whether the points of a scan span more time where its stamp is farther from the next one, as with
+    a head that turns unevenly, or scans that are cut at packets."""
+    last, first = (extreme.reduceat(stream.offset_s, stream.start[:-1]) for extreme in (np.maximum, np.minimum))
+    period_s = 1e-9 * float(np.median(np.diff(stream.stamps_ns)))
+    span = (last - first)[:-1].astype(np.float64) / period_s
+    longer, step = np.where(np.diff(number) == 1, span - np.median(span), 0.0), np.diff(delay)
+    total = float((step**2).sum())
+    share = float((longer * step).sum()) / total
+    return share, float(np.sqrt((((longer - share * step) * step) ** 2).sum())) / total
 
 
 def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
