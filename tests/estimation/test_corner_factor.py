@@ -164,6 +164,19 @@ def test_estimating_the_common_error_explicitly_gives_the_same_normal_equations(
     size = np.sqrt(np.maximum(np.diag(expected_H), 1e-9 * np.diag(expected_H).max()))
     np.testing.assert_allclose(H / np.outer(size, size), expected_H / np.outer(size, size), rtol=0, atol=1e-6)
     np.testing.assert_allclose(g / size, expected_g / size, rtol=0, atol=1e-6 * float(np.linalg.norm(r)))
+    _, out, pieces = run(with_field, near)
+    pieces, B, cluster = make_pieces(factor.n_keyframes, factor.layout.size + 2), factor.layout.size, np.arange(n) % 2
+    for piece in pieces:
+        with_field.accumulate_clusters(near, piece, out, cluster, 2, B)
+    left = r - F @ np.linalg.solve(M, F.T @ r)
+    of_row = np.tile(cluster[factor.keep], 2)
+    found = dense(pieces, factor.n_keyframes)[0][:, -2:]
+    for k in range(2):
+        pulled = np.linalg.solve(M, F.T @ (left * (of_row == k)))
+        expected = J.T @ (left * (of_row == k)) - J.T @ F @ pulled
+        np.testing.assert_allclose(
+            found[: len(size), k] / size, expected / size, rtol=0, atol=1e-6 * float(np.linalg.norm(r))
+        )
 
 
 def whitened(factor, setup, state, field):

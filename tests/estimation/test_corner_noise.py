@@ -9,9 +9,19 @@ import pytest
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
+from icalib.model.statistics import Fit
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.assess import lens_models
-from icalib.sensors.camera.corner_noise import NoiseModel, estimate_noise, image_flow, image_speed
+from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.corner_noise import (
+    NoiseModel,
+    estimate_noise,
+    from_middle,
+    image_flow,
+    image_speed,
+    with_jitter,
+)
+from icalib.sensors.camera.corner_statistics import DELAY
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 
@@ -69,3 +79,28 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
     inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
     assert len(list(lens_models.wrong_models(cast(Inputs, inputs), cast(Estimate, found)))) == large
+
+
+@pytest.mark.parametrize("jitter_s", [0.0, 2e-3])
+def test_jitter_and_rate_of_a_clock_are_found_from_the_delays(unlike, setup_of, factor_of, jitter_s):
+    """Delays estimated to 0.1 ms; without jitter they are noise alone."""
+    setup = setup_of(unlike)
+    factor, rng, start_s, error_s, rate = factor_of(setup, 0), np.random.default_rng(5), 1e-3, 1e-4, 2e-3
+    n, count = len(factor.stream.uv), len(factor.views.image)
+    flow = np.full((n, 2, 1), 300.0)
+    factor = replace(factor, noise=CornerNoise(np.full(n, 0.2), np.array([start_s]), flow))
+    out = factor.output(np.float64)
+    out.root[:] = 5.0
+    shrunk = start_s**2 / (start_s**2 + error_s**2)  # of an estimate with a prior of start_s
+    true = rng.normal(0.0, np.hypot(jitter_s, error_s), count) if jitter_s else rng.normal(0.0, error_s, count)
+    out.shared[:, 0] = shrunk * (true + rate * from_middle(factor.stream)[factor.views.image])
+    fit = Fit("cam0", DELAY, count, shrunk * count, float((out.shared**2).sum() / start_s**2))
+    present = NoiseModel(0.2, jitter=start_s, rate=1e-5)
+    model = with_jitter(NoiseModel(0.2), present, factor, out, fit)
+    spread = np.hypot(jitter_s, error_s) / (from_middle(factor.stream).std() * np.sqrt(count))
+    assert model.rate == pytest.approx(1e-5 + shrunk * rate, abs=4.0 * spread)
+    if jitter_s:
+        assert model.jitter == pytest.approx(jitter_s, abs=4.0 * model.jitter_std)
+        assert model.jitter_std == pytest.approx(model.jitter / np.sqrt(2.0 * count), rel=0.05)
+    else:
+        assert model.jitter == model.jitter_std == 0.0
