@@ -62,6 +62,7 @@ class ImuData:
     seams: tuple[tuple[float, float], ...] = ()
     forwards: bool = False
     unit: Key | None = None
+    sampling: Sampling = "instantaneous"
 
     def unit_length(self, state: State) -> float:
         """The unit of length [m] at `state`."""
@@ -72,8 +73,6 @@ class ImuData:
         if self.unit is None:
             return np.zeros(0, dtype=np.int64)
         return layout.columns(*self.unit) if layout.has(*self.unit) else np.full(1, -1)
-
-    sampling: Sampling = "instantaneous"
 
     @cached_property
     def signals(self) -> tuple[np.ndarray, np.ndarray]:
