@@ -111,7 +111,7 @@ def test_a_table_of_another_name_is_found_by_its_number_of_rows(tmp_path):
     assert any("its frames have the stamps of frames.csv" in note for note in recording.notes())
     assert set(recording.files()) == {tmp_path / "cam0.mp4", tmp_path / "frames.csv"}
     times(tmp_path / "again.csv", FRAMES)
-    with pytest.raises(RecordingError, match=r"again\.csv and frames\.csv both .* rename the right one to cam0\.csv"):
+    with pytest.raises(RecordingError, match=r"again\.csv and frames\.csv both .* rename the right one to"):
         list(open_recording(tmp_path).payloads("cam0.mp4"))
 
 

@@ -64,13 +64,13 @@ def stamp_table(path: Path) -> Path | None:
         return None
     with _opened(path) as video:
         frames = int(video.get(_property("FRAME_COUNT")))
-    found = [table for table in tables if _has_stamps(table, path.name, frames)]
-    if len(found) > 1:
+    fitting = [table for table in tables if _has_stamps(table, path.name, frames)]
+    if len(fitting) > 1:
         raise RecordingError(
-            f"{path}: {' and '.join(p.name for p in found)} both have a stamp for each of its {frames} frames; rename "
-            f"the right one to {path.stem}{found[0].suffix}."
+            f"{path}: {' and '.join(p.name for p in fitting)} both have a stamp for each of its {frames} frames; "
+            f"rename the right one to {path.stem}{fitting[0].suffix}."
         )
-    return found[0] if found else None
+    return fitting[0] if fitting else None
 
 
 def _has_stamps(table: Path, video: str, count: int) -> bool:

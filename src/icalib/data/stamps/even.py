@@ -46,7 +46,7 @@ Follows = Callable[[np.ndarray, np.ndarray], tuple[float, float]]
 
 
 @dataclass(frozen=True)
-class _Fit:
+class _EvenFit:
     """even (N,) [ns]: stamps at multiples of `period` [ns]; number (N,): these multiples; losses: share of bursts
     before which readings were lost; lines: number of lines of which the clock is composed."""
 
@@ -159,7 +159,7 @@ def followed(
     return share, _OVERLAP * float(np.sqrt(((along - share * square) ** 2).sum())) / total
 
 
-def _is_accepted(fit: _Fit, delay: np.ndarray, in_bursts: bool, follows: Follows) -> bool:
+def _is_accepted(fit: _EvenFit, delay: np.ndarray, in_bursts: bool, follows: Follows) -> bool:
     """Whether the device ran evenly. Where measurements cannot show it, late stamps are accepted, and jitter is not.
     delay (N,) [ns]: of the original stamps."""
     if np.abs(delay).max() < _UNEVEN_NS:
@@ -183,7 +183,7 @@ def _periods(end: np.ndarray, last: np.ndarray) -> list[float]:
     return [period for period in dict.fromkeys(tried) if period > 0.0]
 
 
-def _is_even_but_for_some(delay: np.ndarray, fit: _Fit) -> bool:
+def _is_even_but_for_some(delay: np.ndarray, fit: _EvenFit) -> bool:
     """True if no reading was lost, most delays (N,) [ns] are about zero, and all other stamps are late."""
     near = _ON_GRID_PERIODS * fit.period
     return fit.losses == 0.0 and bool((np.abs(delay) < near).mean() > _MIN_ON_GRID_SHARE and delay.min() > -near)
@@ -194,7 +194,7 @@ def _wander(delay: np.ndarray) -> float:
     return float(np.diff(np.quantile(delay, [0.05, 0.95]))[0])
 
 
-def _fitted(ns: np.ndarray, last: np.ndarray, period: float, in_bursts: bool) -> _Fit | None:
+def _fitted(ns: np.ndarray, last: np.ndarray, period: float, in_bursts: bool) -> _EvenFit | None:
     """Even stamps, from the refined period and the lower envelope of the delays; gaps are left for lost readings.
 
     ns: original stamps (N,); last: index of the last reading of each burst. None if there are too many losses, or if
@@ -220,7 +220,7 @@ def _fitted(ns: np.ndarray, last: np.ndarray, period: float, in_bursts: bool) ->
         clock = np.interp(number, at, free[0])
     else:
         clock = (_line(at, free[0]) if one_sided else _line(burst, delay))(number)
-    return _Fit(period * number + clock, number, period, losses / len(last), blocks if wanders else 1)
+    return _EvenFit(period * number + clock, number, period, losses / len(last), blocks if wanders else 1)
 
 
 def _wanders(at: np.ndarray, free: np.ndarray) -> bool:

@@ -18,7 +18,7 @@ from icalib.rig import Rig
 from icalib.sensors.camera.read.checks import checked_corners
 from icalib.sensors.camera.read.corners import CORNER_TABLE, CornerRows, group_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
-from icalib.sensors.camera.read.even_images import with_even_stamps
+from icalib.sensors.camera.read.even_images import ReadImages, with_even_stamps
 from icalib.sensors.camera.read.image_tracks import find_all_tracks
 from icalib.sensors.camera.read.images import image_topic
 from icalib.sensors.camera.read.tracks import read_track_stamps, read_tracks
@@ -63,11 +63,12 @@ def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> l
     sensors, images get even stamps, see `with_even_stamps`.
 
     Raises RecordingError if data are missing or cannot be read, or if two cameras share an image topic."""
-    streams = _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
+    streams: list[ReadImages] = _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
     if reading.rig.cameras_alone:
-        return streams
+        return [*streams]
     names = {stream.name for stream, _ in streams}
-    return with_even_stamps(streams, {c.name: f"{where(recording, c)} ({c.name})" for c in sensors if c.name in names})
+    sources = {c.name: f"{where(recording, c)} ({c.name})" for c in sensors if c.name in names}
+    return [*with_even_stamps(streams, sources)]
 
 
 def where(recording: Recording, camera: Camera) -> str:
@@ -150,7 +151,7 @@ def _has_images(recording: Recording, camera: Camera) -> bool:
     return named or not has_corners(recording, camera)
 
 
-def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadImages]:
     """Track streams of the cameras with tracks, each with notes. Features of images are numbered above those of tables,
     so that they share none."""
     pictured = [c for c in cameras if c.tracks_images]
@@ -168,7 +169,7 @@ def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -
     return [(reading.cut(stream, f"the tracks of {stream.name}"), notes) for stream, notes in streams]
 
 
-def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadStream]:
+def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) -> list[ReadImages]:
     """Checked corner streams of the cameras that may see the target, each with notes; none without a target."""
     target = reading.rig.target
     seeing = [c for c in cameras if reading.rig.has_target and (c.tracks is None or sees(recording, c))]

@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 
 from icalib.data.measurements import CornerStream, TrackStream
-from icalib.data.recordings.base import ReadStream
 from icalib.data.stamps.even import EvenStamps, even_stamps, followed, stamp_scatter
 
+ReadImages = tuple[CornerStream | TrackStream, tuple[str, ...]]  # a stream, and notes for the user
 _MIN_SHARED = 0.5  # of the images of a camera have stamps of another one, if both are triggered together
 
 
-def with_even_stamps(read: Sequence[ReadStream], where: Mapping[str, str]) -> list[ReadStream]:
+def with_even_stamps(read: Sequence[ReadImages], where: Mapping[str, str]) -> list[ReadImages]:
     """The streams of corners and tracks, with even stamps where the cameras run evenly, and notes on these.
     `jitter_s` of a stream is what even stamps may still be off, or the scatter of uneven ones.
 
