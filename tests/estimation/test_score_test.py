@@ -53,18 +53,18 @@ def test_the_step_is_that_of_an_estimate_with_turned_positions(kind):
     (factor,) = of_type(problem.factors, PoseFactor)
     segments = Segments.of(problem, outcome, 8)
     assert segments is not None
-    found = score_test(segments, outcome, factor.with_turned_positions, 3, 0.0)
-    assert found is not None
-    np.testing.assert_allclose(found.value, -3.0 * TURN, atol=0.03)
-    back = replace(measured.poses[0], position=turned(measured.poses[0], found.value, kind).position)
+    effect = score_test(segments, outcome, factor.with_turned_positions, 3, 0.0)
+    assert effect is not None
+    np.testing.assert_allclose(effect.value, -3.0 * TURN, atol=0.03)
+    back = replace(measured.poses[0], position=turned(measured.poses[0], effect.value, kind).position)
     again = replace(inputs, measurements=inputs.measurements.with_streams(back))
     options = replace(DEFAULT_OPTIONS, measurement_model=before.measurement_model)
     after = estimate(again, outcome.state, options).outcome.state
     columns = inputs.layout.columns("mocap0", "translation")
     moved = after.values["mocap0", "translation"] - outcome.state.values["mocap0", "translation"]
     turn = Rotation.from_matrix(outcome.state.values["mocap0", "rotation"].T @ after.values["mocap0", "rotation"])
-    np.testing.assert_allclose(moved, found.change[columns], atol=1e-3)
-    expected = found.change[inputs.layout.columns("mocap0", "rotation")]
+    np.testing.assert_allclose(moved, effect.change[columns], atol=1e-3)
+    expected = effect.change[inputs.layout.columns("mocap0", "rotation")]
     np.testing.assert_allclose(turn.as_rotvec(), expected, atol=0.15 * float(np.linalg.norm(expected)) + 1e-4)
 
 

@@ -64,25 +64,25 @@ def inner_contradictions(
     if segments is None or not outcome.converged:
         return
     for factor, _ in pairs_of(estimate.problem.factors, outcome.residuals, PoseFactor):
-        found = score_test(segments, outcome, factor.with_turned_positions, 3, COVERED_SIGMAS)
-        if found is None:
+        turn = score_test(segments, outcome, factor.with_turned_positions, 3, COVERED_SIGMAS)
+        if turn is None:
             continue
-        relative, change = inputs.sensor(factor.name).kind == "relative", found.change.copy()
+        relative, change = inputs.sensor(factor.name).kind == "relative", turn.change.copy()
         columns = inputs.layout.columns(factor.name, "rotation")
         if relative and columns.min() >= 0:
-            by_positions = change[columns] + found.value
+            by_positions = change[columns] + turn.value
             change[columns] = np.where(np.abs(by_positions) > np.abs(change[columns]), by_positions, change[columns])
-        yield _turned_words(factor.name, relative, found) if found.sigmas > SIGMAS else "", change
+        yield _turned_words(factor.name, relative, turn) if turn.sigmas > SIGMAS else "", change
 
 
-def _turned_words(name: str, relative: bool, found: LeftOut) -> str:
+def _turned_words(name: str, relative: bool, turn: LeftOut) -> str:
     """A sentence on positions that are turned against rotations."""
     what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
-    angle = float(np.linalg.norm(found.value))
-    axis = ", ".join(f"{-x:.2f}" for x in found.value / angle)
+    angle = float(np.linalg.norm(turn.value))
+    axis = ", ".join(f"{-x:.2f}" for x in turn.value / angle)
     return (
         f"rotations and {what} of {name} contradict each other: its {what} are turned by {np.rad2deg(angle):.2g} deg, "
-        f"{found.sigmas:.0f} standard deviations, about the axis ({axis}) of its {axes}; the printed standard "
+        f"{turn.sigmas:.0f} standard deviations, about the axis ({axis}) of its {axes}; the printed standard "
         "deviations cover the difference. To rely on its rotations, state a position_noise ten times as large as noted."
     )
 
