@@ -193,6 +193,19 @@ def test_calibration_parameters_between_held_and_moved(factor):
     assert decrease == pytest.approx(-0.5 * 3.0 * expected, rel=1e-12)
 
 
+def test_a_direction_that_only_the_prior_of_a_nuisance_parameter_bounds_moves():
+    """y = 30 (x + n) + noise with a prior on n: as observable as the prior says, and not fixed."""
+    row, prior_sigma = np.array([30.0, 30.0]), 14.0
+    information = np.outer(row, row) + np.diag([0.0, prior_sigma**-2.0])
+    gradient = np.array([-60.0, -60.0 + 0.01])
+    assert np.linalg.eigvalsh(information)[0] < UNOBSERVABLE_BELOW
+    step, decrease = calib_step(information, gradient, np.ones(2), essential=np.array([0]))
+    np.testing.assert_allclose(step, -np.linalg.solve(information, gradient), rtol=1e-6)
+    assert decrease == pytest.approx(0.5 * gradient @ np.linalg.solve(information, gradient), rel=1e-6)
+    fixed, _ = calib_step(information, gradient, np.ones(2), np.array([[1.0], [0.0]]), np.array([0]))
+    assert fixed[0] == 0.0 and fixed[1] == pytest.approx(-gradient[1] / information[1, 1])
+
+
 @pytest.mark.parametrize("keyframe", [0, 4, 8])
 def test_a_keyframe_that_nothing_determines_is_an_error(keyframe):
     pieces = random_pieces(9, 2)

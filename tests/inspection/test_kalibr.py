@@ -10,6 +10,7 @@ import pytest
 import yaml
 
 from icalib.export import kalibr as export
+from icalib.export.common import CameraParameters
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid, Checkerboard
 from icalib.tools.inspection.kalibr import MODELS, find_kalibr_files
@@ -79,7 +80,8 @@ def test_all_three(tmp_path):
 def test_what_is_exported_is_read_back(model, tmp_path):
     """Both tables of models are the same one."""
     params = np.linspace(1.0, 2.0, len(camera_model(model).parameter_names))
-    fields = export._lens_fields(model, params) | {"resolution": [64, 48]}
+    lens = CameraParameters(model, params[:4].tolist(), params[4:].tolist(), (64, 48), "")
+    fields = export._lens_fields(lens)
     (camera,) = found_with(tmp_path, camchain=yaml.safe_dump({"cam0": fields})).cameras
     assert camera.model == model
     np.testing.assert_array_equal((*camera.intrinsics, *camera.distortion), params)

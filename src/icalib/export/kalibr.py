@@ -12,10 +12,8 @@ import numpy as np
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.export.common import imu_values, inverse, restarts, time_offset
+from icalib.export.common import CameraParameters, imu_values, inverse, lens_of, restarts, time_offset
 from icalib.geometry import so3
-from icalib.geometry.cameras import camera_model
-from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration
 from icalib.sensors.camera.record import CornerResiduals, image_of
 
@@ -54,7 +52,8 @@ def camchain(calibration: Calibration) -> str:
     of the rig, as Kalibr requires."""
     c = calibration
     overlaps = cam_overlaps(c)
-    data = {f"cam{i}": _camera(c, i, overlaps) for i in range(len(c.cameras))}
+    lenses = [lens_of(c, name, "Kalibr", tuple(KALIBR_MODELS)) for name in c.cameras]
+    data = {f"cam{i}": _camera(c, i, lens, overlaps) for i, lens in enumerate(lenses)}
     comment = "# Kalibr's camchain by icalib. "
     if c.imu is None:
         comment += "T_cn_cnm1 takes coordinates in the frame of the camera before to this one's."
@@ -64,7 +63,7 @@ def camchain(calibration: Calibration) -> str:
             "this one; t_imu = t_cam + timeshift_cam_imu [s]. The imu frame has the axes of the accelerometer, as "
             "Kalibr's; calibration.yaml has those of the gyroscope."
         )
-    fits = [sentence for i in range(len(c.cameras)) if (sentence := _lens(c, i)[1])]
+    fits = [f"# {lens.sentence}" for lens in lenses if lens.sentence]
     restarting = [
         f"# cam{i} has no timeshift_cam_imu: its clock restarts, and each recording has one of its own."
         for i, name in enumerate(c.cameras)
@@ -104,49 +103,28 @@ def _T_imu_kalibr(c: Calibration) -> np.ndarray:
     return T
 
 
-def _camera(c: Calibration, index: int, overlaps: np.ndarray) -> dict[str, Any]:
+def _camera(c: Calibration, index: int, lens: CameraParameters, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
     T_cam_imu = inverse(c.T_imu_sensor(name))
     data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": (T_cam_imu @ _T_imu_kalibr(c)).tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
-    lens, _ = _lens(c, index)
     return data | {
         "cam_overlaps": np.flatnonzero(overlaps[index]).tolist(),
-        **lens,
-        "resolution": [int(side) for side in c.rig["sensors"][name]["resolution"]],
+        **_lens_fields(lens),
         "rostopic": f"/{name}/image_raw",
         **({} if c.imu is None or restarts(c, name) else {"timeshift_cam_imu": time_offset(c, name)}),
     }
 
 
-def _lens(c: Calibration, index: int) -> tuple[dict[str, Any], str]:
-    """Kalibr's fields of a lens. The second value is a sentence on the error if Kalibr lacks the model and another was
-    fitted to it, else empty."""
-    name = c.cameras[index]
-    sensor = c.rig["sensors"][name]
-    model = sensor["model"]
-    params = np.concatenate([c.group(name, "intrinsics").value, c.group(name, "distortion").value])
-    if model in KALIBR_MODELS:
-        return _lens_fields(model, params), ""
-    width, height = (int(side) for side in sensor["resolution"])
-    source, target = camera_model(model), camera_model("pinhole-radtan")
-    fitted, rms, most = fit_model(source, params, target, (width, height))
-    sentence = (
-        f"# cam{index}: Kalibr has no {model.split('-')[1]}; this radtan follows it to {rms:.2f} px RMS over the "
-        f"image, {most:.1f} px "
-        "at most. calibration.yaml holds what was estimated."
-    )
-    return _lens_fields(target.name, fitted), sentence
-
-
-def _lens_fields(model: str, params: np.ndarray) -> dict[str, Any]:
-    camera, distortion, before = KALIBR_MODELS[model]
+def _lens_fields(lens: CameraParameters) -> dict[str, Any]:
+    camera, distortion, before = KALIBR_MODELS[lens.model]
     return {
         "camera_model": camera,
-        "distortion_coeffs": params[4 + before :].tolist(),
+        "distortion_coeffs": lens.distortion[before:],
         "distortion_model": distortion,
-        "intrinsics": [*params[4 : 4 + before].tolist(), *params[:4].tolist()],
+        "intrinsics": [*lens.distortion[:before], *lens.intrinsics],
+        "resolution": list(lens.resolution),
     }
 
 

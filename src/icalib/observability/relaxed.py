@@ -19,7 +19,7 @@ from icalib.estimate.problem.inputs import Inputs, with_association
 from icalib.estimate.problem.outcome import Linearised, Outcome, outcome_of
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
-from icalib.optim.arrowhead import Solution, solve
+from icalib.optim.arrowhead import Solution
 from icalib.optim.calib_block import NO_DIRECTIONS, restricted_root
 from icalib.optim.prior_factor import sums_of_priors
 from icalib.optim.state import Key, Layout, State
@@ -94,7 +94,7 @@ def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
         problem = estimate.measurement_model.problem(freed, state, fixed_directions)
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
-        solution = solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=fixed_directions)
+        solution = problem.solve(pieces)
     except EstimationError:
         return None
     return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))

@@ -147,7 +147,7 @@ class Factors:
 
     pieces: overwritten by their factors; eliminations: per piece, see `_reduce`. shared (15, 15), shared_side (15, B +
     1): factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
-    marginalised. tolerance, fixed_directions: see `calib_step`.
+    marginalised. tolerance, fixed_directions, essential: see `calib_step`.
     """
 
     pieces: tuple[Piece, ...]
@@ -158,6 +158,7 @@ class Factors:
     information: np.ndarray
     tolerance: np.ndarray
     fixed_directions: np.ndarray
+    essential: np.ndarray | None
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
         """Back substitution of m right-hand sides: steps (K, 15, m) of the keyframes.
@@ -183,9 +184,8 @@ class Factors:
         parameters vary in their observable directions; in the next `still` ones all of them are fixed."""
         m = free + still
         calib = np.zeros((len(self.tolerance) + 1, m))
-        calib[:-1, :free] = calib_draws(
-            self.information, self.tolerance, self.fixed_directions, rng.standard_normal((len(self.tolerance), free))
-        )
+        white = rng.standard_normal((len(self.tolerance), free))
+        calib[:-1, :free] = calib_draws(self.information, self.tolerance, self.fixed_directions, self.essential, white)
         chain = self.back(calib, [rng.standard_normal((n, m)) for n in self.rows()])
         return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), calib[:-1, k].copy()) for k in range(m))
 
@@ -207,7 +207,9 @@ class Solution:
     @classmethod
     def of(cls, factors: Factors, gradient: np.ndarray) -> Solution:
         """The step, from the factors and the `gradient` (B + 1,) of the calibration parameters."""
-        calib, decrease = calib_step(factors.information, gradient[:-1], factors.tolerance, factors.fixed_directions)
+        calib, decrease = calib_step(
+            factors.information, gradient[:-1], factors.tolerance, factors.fixed_directions, factors.essential
+        )
         white = [np.zeros((n, 1)) for n in factors.rows()]
         chain = factors.back(np.append(calib, 1.0)[:, None], white)[:, :, 0]
         return cls(np.ascontiguousarray(chain), calib, decrease - 0.5 * float(gradient[-1]), gradient, factors)
@@ -357,10 +359,12 @@ def solve(
     tolerance: np.ndarray,
     damping: float = 0.0,
     fixed_directions: np.ndarray = NO_DIRECTIONS,
+    essential: np.ndarray | None = None,
 ) -> Solution:
     """Solves (H + damping diag(H)) step = -gradient; overwrites the pieces. Raises NotDefiniteError.
 
-    tolerance (B,); fixed_directions (B, m): directions of the calibration parameters that are fixed, see `calib_step`.
+    tolerance (B,); fixed_directions (B, m), essential: which directions of the calibration parameters are fixed, see
+    `calib_step`.
     """
     keep = len(pieces) > 1
     n_calib = len(tolerance)
@@ -382,5 +386,7 @@ def solve(
         forward_solve(shared, shared_side)
         reduced -= shared_side.T @ shared_side
     information = reduced[:n_calib, :n_calib]
-    factors = Factors(pieces, eliminations, n_keyframes, shared, shared_side, information, tolerance, fixed_directions)
+    factors = Factors(
+        pieces, eliminations, n_keyframes, shared, shared_side, information, tolerance, fixed_directions, essential
+    )
     return Solution.of(factors, reduced[:, n_calib])

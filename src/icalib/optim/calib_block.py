@@ -15,29 +15,41 @@ NO_DIRECTIONS = np.zeros((0, 0))  # no direction is fixed
 
 
 def calib_step(
-    information: np.ndarray, gradient: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray = NO_DIRECTIONS
+    information: np.ndarray,
+    gradient: np.ndarray,
+    tolerance: np.ndarray,
+    fixed_directions: np.ndarray = NO_DIRECTIONS,
+    essential: np.ndarray | None = None,
 ) -> tuple[np.ndarray, float]:
     """Step (B,) of the calibration parameters and its predicted decrease of half the chi^2.
 
-    information (B, B), gradient (B,): of half the chi^2, chain marginalised. Directions are eigenvectors of the
-    information in units of `tolerance` (B,). Those below UNOBSERVABLE_BELOW are fixed, and so are the orthonormal
-    columns of `fixed_directions` (B, m).
+    information (B, B), gradient (B,): of half the chi^2, chain marginalised. essential: columns of all but nuisance
+    parameters (default: all). Fixed are the orthonormal columns of `fixed_directions` (B, m), and eigenvectors below
+    UNOBSERVABLE_BELOW of the information of the essential parameters in units of `tolerance` (B,). Nuisance parameters
+    count as known there: their priors bound a direction that only they leave open.
     """
-    free, values, vectors = _directions(information, tolerance, fixed_directions)
-    projected = vectors.T @ (free.T @ (tolerance * gradient))
-    step = np.where(values > UNOBSERVABLE_BELOW, -projected / np.maximum(values, UNOBSERVABLE_BELOW), 0.0)
-    return tolerance * (free @ (vectors @ step)), float(-0.5 * projected @ step)
+    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    projected = root.T @ (free.T @ (tolerance * gradient))
+    return -tolerance * (free @ (root @ projected)), float(0.5 * projected @ projected)
 
 
-def _directions(
-    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Free columns (B, n), orthogonal to `fixed_directions`, and eigenvalues (n,) and eigenvectors (n, n) of the
-    information within them, in units of `tolerance`."""
-    free = complement(fixed_directions, len(tolerance))
+def _free_root(
+    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, essential: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal directions (B, n) that are not fixed, and a root (n, n) of the inverse of the information within
+    them, in units of `tolerance`. Arguments as in `calib_step`."""
+    n = len(tolerance)
+    columns = np.arange(n) if essential is None else essential
+    others = np.setdiff1d(np.arange(n), columns)
     scaled = information * tolerance[:, None] * tolerance
+    candidates = complement(fixed_directions[columns] if fixed_directions.size else NO_DIRECTIONS, len(columns))
+    values, vectors = np.linalg.eigh(candidates.T @ scaled[np.ix_(columns, columns)] @ candidates)
+    kept = vectors[:, values > UNOBSERVABLE_BELOW]
+    free = np.zeros((n, kept.shape[1] + len(others)))
+    free[columns, : kept.shape[1]] = candidates @ kept
+    free[others, kept.shape[1] :] = np.eye(len(others))
     values, vectors = np.linalg.eigh(free.T @ scaled @ free)
-    return free, values, vectors
+    return free, vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
 
 
 def least_information(information: np.ndarray, tolerance: np.ndarray) -> float:
@@ -74,11 +86,14 @@ def restricted_inverse(information: np.ndarray, fixed_directions: np.ndarray) ->
 
 
 def calib_draws(
-    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, white: np.ndarray
+    information: np.ndarray,
+    tolerance: np.ndarray,
+    fixed_directions: np.ndarray,
+    essential: np.ndarray | None,
+    white: np.ndarray,
 ) -> np.ndarray:
     """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
     that `calib_step` fixes are zero. The root of the covariance is symmetric: signs of eigenvectors do not matter."""
-    free, values, vectors = _directions(information, tolerance, fixed_directions)
-    scaled = np.where(values > UNOBSERVABLE_BELOW, 1.0 / np.sqrt(np.maximum(values, UNOBSERVABLE_BELOW)), 0.0)
-    axes = free @ vectors
-    return tolerance[:, None] * (axes @ (scaled[:, None] * (axes.T @ white)))
+    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    axes = free @ root
+    return tolerance[:, None] * (axes @ ((axes / np.linalg.norm(axes, axis=0)).T @ white))

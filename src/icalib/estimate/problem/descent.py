@@ -14,7 +14,7 @@ from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver_options import ROUNDING_SHARE, SolverOptions
 from icalib.motion.factor import Residuals
 from icalib.optim.anderson import MIN_ACCELERATED_GAIN, Accelerator
-from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution, solve
+from icalib.optim.arrowhead import NotDefiniteError, Piece, Solution
 from icalib.optim.calib_block import DETERMINED_ABOVE, essential_information
 from icalib.optim.prior_factor import Prior, sums_of_priors
 from icalib.optim.state import State
@@ -301,6 +301,4 @@ class Descent:
         return self.problem.linearise(state, self.pieces, self.residuals, sums, curved)
 
     def _solve(self, damping: float) -> Solution:
-        return solve(
-            self.pieces, self.problem.n_keyframes, self.problem.tolerance, damping, self.problem.fixed_directions
-        )
+        return self.problem.solve(self.pieces, damping)

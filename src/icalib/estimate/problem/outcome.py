@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.estimate.problem.problem import Problem
 from icalib.motion.factor import Residuals
-from icalib.optim.arrowhead import Draw, Piece, Solution, solve
+from icalib.optim.arrowhead import Draw, Piece, Solution
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.state import State
 
@@ -132,4 +132,4 @@ def posterior(problem: Problem, state: State) -> Draws:
     """Draws from the posterior at `state`. Raises NotDefiniteError."""
     pieces = problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return Draws.of(solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions))
+    return Draws.of(problem.solve(pieces))

@@ -130,7 +130,7 @@ class _Noise:
         """Solver's step (K, 15) of the chain for `problem`, calibration parameters fixed."""
         pieces = self.outcome.workspace or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
-        factors = solve(pieces, problem.n_keyframes, problem.tolerance).factors
+        factors = solve(pieces, problem.n_keyframes, problem.tolerance, essential=problem.layout.essential).factors
         # Zero steps of the calibration parameters, then factor 1 of the gradient, see `Factors.back`.
         calib = np.append(np.zeros(problem.layout.size), 1.0)[:, None]
         return factors.back(calib, [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]

@@ -15,7 +15,7 @@ from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.model.target_factor import TargetFactor
 from icalib.motion.factor import Residuals, of_type
-from icalib.optim.arrowhead import Piece, solve
+from icalib.optim.arrowhead import Piece
 from icalib.optim.state import State
 
 SIZE_STEP = 1e-3  # relative step of difference quotients: small enough for p to be quadratic, large against rounding
@@ -74,6 +74,4 @@ def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scrat
     """Approximate minimum over all parameters of half the robust chi^2: its value at `state`, less the decrease that
     one Newton step predicts. Overwrites `pieces` and `scratch`."""
     cost = problem.linearise(state, pieces, scratch, curved=True)
-    return (
-        cost - solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).decrease
-    )
+    return cost - problem.solve(pieces).decrease
