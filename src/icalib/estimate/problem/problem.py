@@ -13,15 +13,8 @@ import numpy as np
 from icalib.estimate.problem.gauge import hold_frame
 from icalib.motion.factor import Factor, FactorKey, Residuals, Whitened, keyed
 from icalib.motion.imu_data import ImuData
-from icalib.optim.arrowhead import (
-    Piece,
-    Solution,
-    in_parallel,
-    make_pieces,
-    marginalise,
-    marginalise_in_segments,
-    solve,
-)
+from icalib.optim import arrowhead
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, marginalise, marginalise_in_segments
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State
@@ -111,9 +104,10 @@ class Problem:
         ends = tuple(int(k) for k in keyframes)
         return self.replacing([f.cut(state, ends) for f in self.factors.values()])
 
-    def solve(self, pieces: tuple[Piece, ...], damping: float = 0.0) -> Solution:
+    def solve(self, pieces: tuple[Piece, ...], damping: float = 0.0) -> arrowhead.Solution:
         """See `arrowhead.solve`; overwrites the pieces."""
-        return solve(pieces, self.n_keyframes, self.tolerance, damping, self.fixed_directions, self.layout.essential)
+        fixed, essential = self.fixed_directions, self.layout.essential
+        return arrowhead.solve(pieces, self.n_keyframes, self.tolerance, damping, fixed, essential)
 
     def marginal(self, sums_of: Callable[[int, int], Piece]) -> np.ndarray:
         """System (B + 1, B + 1) of the calibration parameters and their gradient, all keyframes eliminated. sums_of:
