@@ -185,7 +185,7 @@ class Factors:
         m = free + still
         calib = np.zeros((len(self.tolerance) + 1, m))
         white = rng.standard_normal((len(self.tolerance), free))
-        calib[:-1, :free] = calib_draws(self.information, self.tolerance, self.fixed_directions, self.essential, white)
+        calib[:-1, :free] = calib_draws(self.information, self.tolerance, self.fixed_directions, white, self.essential)
         chain = self.back(calib, [rng.standard_normal((n, m)) for n in self.rows()])
         return tuple(Draw(np.ascontiguousarray(chain[:, :, k]), calib[:-1, k].copy()) for k in range(m))
 

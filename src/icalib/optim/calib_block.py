@@ -89,8 +89,8 @@ def calib_draws(
     information: np.ndarray,
     tolerance: np.ndarray,
     fixed_directions: np.ndarray,
-    essential: np.ndarray | None,
     white: np.ndarray,
+    essential: np.ndarray | None = None,
 ) -> np.ndarray:
     """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
     that `calib_step` fixes are zero. The root of the covariance is symmetric: signs of eigenvectors do not matter."""
