@@ -29,7 +29,7 @@ def truth() -> tuple[Inputs, State]:
     scenario = Scenario(
         (),
         duration_s=40.0,
-        motion=Drive("free", exact=True),
+        motion=Drive("free"),
         board=False,
         room=Room((8.0, 6.0, 3.0)),
         sensors=(mocap,),
@@ -43,6 +43,7 @@ def truth() -> tuple[Inputs, State]:
     late = true.time_offset["mocap0"] + (sim.measurements.poses[0].origin_ns - imu.origin_ns) * 1e-9
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
+        ("world", "gravity"): np.array([9.81]),
         ("mocap0", "scale"): np.ones(1),
         ("mocap0", "rotation"): mocap.T_imu_sensor[:3, :3].copy(),
         ("mocap0", "translation"): mocap.T_imu_sensor[:3, 3].copy(),

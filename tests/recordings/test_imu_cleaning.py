@@ -142,7 +142,9 @@ def test_a_held_accelerometer_is_interpolated(waved):
 class TestEvenStamps:
     def even(self, imu: ImuStream, values: np.ndarray) -> EvenStamps | None:
         n = len(values)
-        return even_stamps(imu.stamps_ns, lambda *fit: followed(*fit, np.zeros(n), np.arange(n), values))
+        return even_stamps(
+            imu.stamps_ns, lambda number, delay: followed(number, delay, np.zeros(n), np.arange(n), values)
+        )
 
     @pytest.mark.parametrize("burst", [2, 5, 10, 32])
     @pytest.mark.parametrize("within_ns", [0, 1000, 100_000])

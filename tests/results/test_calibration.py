@@ -132,23 +132,10 @@ def test_arrays_that_would_run_code(saved: Path):
     assert "cannot be read" in sentence_of(saved)
 
 
-def test_results_of_format_3_have_two_words_for_undetermined(calibration: Calibration, saved: Path):
-    """What lies in the null space was at its guess; all else had a standard deviation above ten tolerances."""
-    file = saved / "result.json"
-    old = json.loads(file.read_text()) | {"format_version": 3}
-    old["undetermined"] = old.pop("unobservable")
-    (translation,) = (g for g in old["groups"] if (g["sensor"], g["name"]) == ("cam1", "translation"))
-    translation["verdict"] = ["undetermined", "undetermined", "weak"]  # y is in the null space
-    file.write_text(json.dumps(old))
-    loaded = load_calibration(saved)
-    assert loaded.group("cam1", "translation").verdict == ("too uncertain", "unobservable", "weak")
-    assert loaded.unobservable == calibration.unobservable
-
-
 @pytest.mark.parametrize(
     "changes",
     [
-        {"format_version": 2},
+        {"format_version": 3},
         {"groups": 3},
         {"groups": [{}]},
         {"groups": [{"sensor": "cam0"}]},

@@ -164,7 +164,7 @@ class ImuData:
             sampling=sampling,
         )
         error = data.interpolation_error() ** 2 * dt[:, None]
-        variance[:, :2] += error
+        variance += error[:, [0, 1, 1]]
         gyro, accel = stream.gyro.var(axis=0).sum() / 3.0, stream.accel.var(axis=0).sum() / 3.0
         # A first-order process of this correlation time and variance, as white noise of the same density.
         variance[gap] += 2.0 * MOTION_CORRELATION_S * np.array([gyro, accel, accel])

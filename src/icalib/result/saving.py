@@ -31,7 +31,6 @@ from icalib.result.cross_validation import CrossValidation, PredictedFit
 from icalib.result.planes import Plane
 from icalib.result.shapes import check_arrays
 from icalib.result.summary import calibration_yaml
-from icalib.result.verdict import in_null_space
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.records import Residuals, RowResiduals
 
@@ -62,8 +61,6 @@ def load_calibration(folder: str | Path) -> Calibration:
     plain = _read_json(folder)
     arrays = _read_npz(folder, plain)
     try:
-        if plain["format_version"] == 3:
-            _replace_undetermined(plain, in_null_space(arrays["null_space"]).tolist())
         calibration = _build(plain, arrays)
         _check(calibration)
     except _MALFORMED as error:
@@ -135,22 +132,12 @@ def _read_json(folder: Path) -> dict[str, Any]:
         raise CalibrationError(f"{path} is damaged or not a result of icalib ({error}); calibrate again.") from error
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         raise CalibrationError(f"{path} is not a result of icalib; give the folder that a calibration was written to.")
-    if plain.get("format_version") not in (3, FORMAT_VERSION):
+    if plain.get("format_version") != FORMAT_VERSION:
         raise CalibrationError(
             f"{path} has format version {plain.get('format_version')}, this icalib reads {FORMAT_VERSION}; "
             "use the icalib that wrote it, or calibrate again."
         )
     return plain
-
-
-def _replace_undetermined(plain: dict[str, Any], is_null: list[bool]) -> None:
-    """Puts today's words into result.json of format 3, which called unobservable and too uncertain components alike
-    undetermined. is_null (B,): whether each estimated parameter lies in the null space."""
-    plain["unobservable"] = plain["undetermined"]
-    for g in plain["groups"]:
-        for i, k in enumerate(g["columns"] or ()):
-            if g["verdict"][i] == "undetermined":
-                g["verdict"][i] = "unobservable" if is_null[k] else "too uncertain"
 
 
 def _read_npz(folder: Path, plain: dict[str, Any]) -> dict[str, np.ndarray]:
