@@ -11,7 +11,7 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
 # Magnitude of gravity, see `rig.gravity`; it belongs to the WORLD.
 WORLD = "world"
-GRAVITY = ParameterSpec("gravity", 1, "nuisance", "m/s^2", ("gravity",), 1e-2, 0.1)
+GRAVITY = ParameterSpec("gravity", 1, "nuisance", "m/s^2", ("gravity",), 0.05, 0.1)
 # Out-of-plane deviation of a body from its design, second order in x, y; basis: `model.bodies.shape_basis`.
 BOW_LABELS = ("bow_xx", "bow_xy", "bow_yy")
 # In-plane deviations by printing and mounting, to second order in x, y. Rotation and translation are omitted, as they
