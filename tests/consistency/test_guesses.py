@@ -107,7 +107,7 @@ def test_good_guesses_are_no_news(simulation):
     [
         ("rotation", r"rotation of cam0 .* alone show 17\d deg .* the inverse"),
         ("translation", "translation . of cam0, -.*millimetres"),
-        ("time_offset", "time offset of cam0, 504.2 ms, .* alone show 4.2"),
+        ("time_offset", "time offset of cam0, 504.2 ms, .* alone show 4\\.(199|2)"),
         ("intrinsics", "intrinsics .. of cam0, .* of another size"),
     ],
 )

@@ -61,7 +61,7 @@ def without_noise(rig):
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
 def test_without_noise_it_is_recovered(kind):
-    scenario = alone(kind, imu_noise_enabled=False, robot_noise_enabled=False)
+    scenario = alone(kind, imu_noise_enabled=False, robot_noise_enabled=False, imu_rate_hz=1000.0)
     sim = simulate(scenario, 1)
     result = calibrate_measurements(rig_for(scenario), sim.measurements)
     turn, way, late = errors(result, sim.truth, "mocap0")

@@ -48,11 +48,6 @@ def errors(setup, state):
     return out
 
 
-def handheld_at_2000_hz(duration_s, asynchronous=False):
-    """At 200 Hz the interpolation leaves 2e-8; second-order terms of readings as recorded 1.5e-8 at 1000 Hz."""
-    return replace(handheld(duration_s, asynchronous=asynchronous, noiseless=True), imu_rate_hz=2000.0)
-
-
 def without_bias(scenario):
     """The broad prior on the biases of the first keyframe, about zero, then pulls nothing."""
     return replace(scenario, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
@@ -64,7 +59,7 @@ def too_large(setup, state, bound):
 
 @pytest.mark.parametrize("asynchronous", [False, True])
 def test_noiseless_recovery(setup_of, problem_of, asynchronous):
-    scenario = without_bias(handheld_at_2000_hz(5.0, asynchronous))
+    scenario = without_bias(handheld(5.0, asynchronous=asynchronous, noiseless=True))
     setup = setup_of(simulate(scenario, seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
     assert too_large(setup, not_none(outcome).state, EXACT) == {}
@@ -78,7 +73,7 @@ def test_noiseless_recovery(setup_of, problem_of, asynchronous):
 @pytest.mark.parametrize("asynchronous", [False, True])
 def test_noiseless_recovery_with_biases(setup_of, problem_of, asynchronous):
     """The prior on the first biases takes a share that shrinks with the recording's length: 20 s are enough."""
-    setup = setup_of(simulate(handheld_at_2000_hz(20.0, asynchronous), seed=1))
+    setup = setup_of(simulate(handheld(20.0, asynchronous=asynchronous, noiseless=True), seed=1))
     outcome = recover(setup, problem_of, setup.perturbed(np.random.default_rng(2), 5.0))
     found = errors(setup, not_none(outcome).state)
     tilt = found.pop(("board0", "tilt"))

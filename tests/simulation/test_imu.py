@@ -36,7 +36,7 @@ def test_noiseless_readings_are_truth_plus_constant_bias():
         biased.truth.gyro_bias,
         atol=1e-14,
     )
-    np.testing.assert_array_equal(biased.truth.accel_bias, np.tile(scenario.accel_bias, (401, 1)))
+    np.testing.assert_array_equal(biased.truth.accel_bias, np.tile(scenario.accel_bias, (4001, 1)))
 
 
 def test_intrinsics_follow_the_scale_misalignment_model():

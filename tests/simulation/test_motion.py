@@ -17,6 +17,7 @@ KINDS = ("handheld", "planar", "single_axis", "motionless")
 def scenario_of(kind, duration_s=3.0, **changes):
     scenario = handheld(duration_s=duration_s, noiseless=True)
     motion = replace(scenario.motion, kind=kind)
+    changes = {"imu_rate_hz": 200.0} | changes
     return replace(scenario, motion=motion, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3, **changes)
 
 

@@ -36,7 +36,7 @@ def calib_step(
 def _free_root(
     information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, essential: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Orthonormal directions (B, n) that are not fixed, and a root (n, n) of the inverse of the information within
+    """Orthonormal directions (B, n) that are not fixed, and a root (n, k) of the inverse of the information within
     them, in units of `tolerance`. Arguments as in `calib_step`."""
     n = len(tolerance)
     columns = np.arange(n) if essential is None else essential
@@ -49,7 +49,8 @@ def _free_root(
     free[columns, : kept.shape[1]] = candidates @ kept
     free[others, kept.shape[1] :] = np.eye(len(others))
     values, vectors = np.linalg.eigh(free.T @ scaled @ free)
-    return free, vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
+    regular = values > MIN_INFORMATION  # far from the solution rounding may leave less
+    return free, vectors[:, regular] / np.sqrt(values[regular])
 
 
 def least_information(information: np.ndarray, tolerance: np.ndarray) -> float:

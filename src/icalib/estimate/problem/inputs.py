@@ -119,7 +119,7 @@ def layout_for(
     entries: list[Entry] = []
     if imu is not None:
         entries += model_of(imu).entries(imu, rig, n_recordings)
-        entries.append(GRAVITY.entry(WORLD, rig.gravity_sigma > 0.0))
+        entries += [GRAVITY.entry(WORLD)] if rig.gravity_sigma > 0.0 else []
     # Without an IMU the frame of the target is the world frame of all recordings.
     levelled = imu is not None and not rig.assumes_motion
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():

@@ -25,9 +25,10 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
         """Yields the factor of all intervals between keyframes. The readings of `at` already contain the noise."""
         del stream, noise
         assert at.motion is not None
-        intrinsics, gravity = at.layout.columns(sensor.name, "intrinsics"), at.layout.columns(WORLD, GRAVITY.name)
+        intrinsics, key = at.layout.columns(sensor.name, "intrinsics"), (WORLD, GRAVITY.name)
+        gravity = at.layout.columns(*key) if at.layout.has(*key) else intrinsics[:0]
         columns = np.concatenate([intrinsics[intrinsics >= 0], at.motion.imu.unit_columns(at.layout)])
-        yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, columns, gravity[gravity >= 0])
+        yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, columns, gravity)
 
 
 MODEL = ImuModel()

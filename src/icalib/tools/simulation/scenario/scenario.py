@@ -221,13 +221,16 @@ def handheld(
     AprilGrid.
 
     asynchronous: cam1 takes its images half a period after cam0. imu "noisy": ten times the data sheet's densities.
-    noiseless: neither corners nor IMU have noise, but `rig_for` still states the sigmas.
+    noiseless: neither corners nor
+    IMU have noise, and the IMU has 2000 Hz, at which interpolation between readings leaves 1e-8; `rig_for` still states
+    the sigmas.
     """
     scale = {"datasheet": 1.0, "noisy": 10.0}[imu]
     return Scenario(
         _euroc_cameras(phase_s=0.025 if asynchronous else 0.0),
         duration_s=duration_s,
         imu_noise=replace(ADIS16448.scaled(scale), source="simulation"),
+        imu_rate_hz=2000.0 if noiseless else 200.0,
         imu_noise_enabled=not noiseless,
         corner_noise_enabled=not noiseless,
         imu_clock_origin_ns=_EUROC_EPOCH_NS,
