@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.text_files import write_texts
+from icalib.base.files import write_texts
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo import RunRecord, StudyPlan, run_study
 from icalib.tools.montecarlo.study import scenario_digest

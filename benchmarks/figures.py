@@ -23,7 +23,7 @@ from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.initial_state import initial_state
+from icalib.sensors.camera.initialize.multi_recording import initial_state
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.sensors.camera.model import MODEL
 

@@ -27,7 +27,7 @@ from icalib.tools.simulation import (
     write_sensors,
     write_tables,
 )
-from icalib.tools.simulation.output.bag_writer import IMU, IMU_TOPIC, BagForm, BagWriter
+from icalib.tools.simulation.output import IMU, IMU_TOPIC, BagForm, BagWriter
 
 _AT = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
 _ABOVE = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 1.5], [0, 0, 0, 1]]"

@@ -16,12 +16,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from icalib.base.text_files import write_texts
+from icalib.base.files import write_texts
 from icalib.result.quantities import format_number
 from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.montecarlo.record import from_json
-from icalib.tools.montecarlo.statistics import Nees
-from icalib.tools.montecarlo.summary import consistency_json, summarise
+from icalib.tools.montecarlo.summary import Nees, consistency_json, summarise
 
 DOCS = Path(__file__).resolve().parent.parent / "docs"
 PAGE, STUDIES = DOCS / "montecarlo.md", DOCS / "studies"

@@ -23,8 +23,7 @@ from icalib.geometry.targets import NoTarget
 from icalib.optim.arrowhead import Piece, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.initial_state import initial_state
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "paper" / "table2-3d.yaml"

@@ -15,7 +15,7 @@ import yaml
 from tests.typed import instance
 
 from icalib import pipeline
-from icalib.base.own_files import sealed
+from icalib.base.files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry import so3

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.base.file_hashes import HashedFile, hash_of
-from icalib.base.unpacking import load_arrays
+from icalib.base.input_files import HashedFile, hash_of, load_arrays
 from icalib.data.recordings import open_recording
 from icalib.result.provenance import provenance
 from icalib.tools.simulation import handheld, simulate, write_sensors

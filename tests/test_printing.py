@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from icalib.base.own_files import sealed
+from icalib.base.files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag, Target

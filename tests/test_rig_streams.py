@@ -15,8 +15,8 @@ from icalib.data.measurements import (
     PoseStream,
     TrackStream,
     WheelStream,
+    streams_of_rig,
 )
-from icalib.data.same_rig import streams_of_rig
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Wheels, by_name

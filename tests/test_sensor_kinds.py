@@ -30,7 +30,6 @@ NAMING = {
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
     "tools/allan/analysis.py",  # the noise of IMUs
-    "tools/allan/sampling.py",  # the readings of IMUs
     "tools/simulation/images/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario/scenario.py",

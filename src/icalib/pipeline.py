@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from icalib.data.measurements import Measurements
+from icalib.data.measurements import Measurements, streams_of_rig
 from icalib.data.recordings import Recording, read_measurements
 from icalib.data.recordings.base import Progress
-from icalib.data.recordings.reading import without_jumps
-from icalib.data.recordings.several import Source, naming, noting, open_all
-from icalib.data.same_rig import streams_of_rig
+from icalib.data.recordings.opening import Source, naming, noting, open_all, without_jumps
 from icalib.errors import EstimationError, RecordingError
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Visit

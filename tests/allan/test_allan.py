@@ -18,11 +18,10 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError, RecordingError
 from icalib.rig.file import load_rig
 from icalib.tools.allan import allan_deviation, study_imu, study_recording, write_study
-from icalib.tools.allan.deviation import allan_deviation_of_all, model_variance
+from icalib.tools.allan.analysis import allan_deviation_of_all, model_variance, still_readings
 from icalib.tools.allan.fit import AllanFit, _most_likely, _std, bands_of, bands_of_all, fit_noise, pooled
-from icalib.tools.allan.sampling import still_readings
 from icalib.tools.simulation import handheld
-from icalib.tools.simulation.output.bag_writer import IMU, BagForm, BagWriter
+from icalib.tools.simulation.output import IMU, BagForm, BagWriter
 from icalib.tools.simulation.sensors.imu import read_imu
 
 TRUTH = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}

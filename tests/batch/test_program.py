@@ -4,7 +4,7 @@ import hashlib
 from pathlib import Path
 
 import icalib
-from icalib.tools.batch.program import program
+from icalib.tools.batch import program
 
 
 def test_the_digest_is_of_all_of_the_source():

@@ -8,8 +8,7 @@ import pytest
 
 from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
-from icalib.tools.batch import Crew, FailedTask, run_all, write_atomically
-from icalib.tools.batch.workers import _answer
+from icalib.tools.batch import Crew, FailedTask, _answer, run_all, write_atomically
 
 
 def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():

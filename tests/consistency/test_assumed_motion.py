@@ -20,7 +20,7 @@ from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.montecarlo.one_run import error, true_value
 from icalib.tools.simulation import Drive, Scenario, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

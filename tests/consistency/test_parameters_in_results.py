@@ -15,7 +15,7 @@ from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.sensor import MOUNTED
 from icalib.tools.comparison.compare import compare_sides
 from icalib.tools.comparison.results import side_of_result
-from icalib.tools.montecarlo.truth import true_value
+from icalib.tools.montecarlo.one_run import true_value
 from icalib.tools.simulation import rig_for, simulate
 
 pytestmark = pytest.mark.slow

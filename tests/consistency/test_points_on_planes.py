@@ -15,7 +15,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.statistics import Sample, nees
+from icalib.tools.montecarlo.summary import Sample, nees
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

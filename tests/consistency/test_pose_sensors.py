@@ -14,7 +14,7 @@ from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import relative_poses
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.montecarlo.one_run import error, true_value
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, rig_for, simulate
 from icalib.tools.simulation.scenario.robot import DriveKind
 

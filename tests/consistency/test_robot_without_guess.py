@@ -19,7 +19,7 @@ from icalib.result.verdict import UNUSABLE
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.montecarlo.one_run import RunTask, run
-from icalib.tools.montecarlo.statistics import Sample, nees
+from icalib.tools.montecarlo.summary import Sample, nees
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

@@ -20,7 +20,7 @@ from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.truth import error
+from icalib.tools.montecarlo.one_run import error
 from icalib.tools.simulation import Drive, Scenario, handheld, rig_for, simulate
 
 MOUNT, FRAME = pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5])

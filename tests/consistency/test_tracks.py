@@ -18,8 +18,7 @@ from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.initial_state import initial_state
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
 from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 

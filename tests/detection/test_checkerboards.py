@@ -8,10 +8,10 @@ import pytest
 
 from icalib.detection import CheckerboardDetector
 from icalib.detection.boards import checkerboard as module
+from icalib.detection.boards.checkerboard import shows_grid
 from icalib.detection.boards.detectors import detector_of
 from icalib.detection.primitives.corners import ImageCorners
-from icalib.detection.primitives.crossings import shows_grid
-from icalib.detection.turns import number_continuously
+from icalib.detection.sightings import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
 
 

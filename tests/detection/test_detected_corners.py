@@ -11,7 +11,7 @@ import pytest
 from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
-from icalib.detection.images import image_work
+from icalib.detection import images as image_work
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid

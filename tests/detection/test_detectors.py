@@ -19,7 +19,7 @@ from icalib.detection import (
 )
 from icalib.detection.boards.detectors import detector_of
 from icalib.detection.primitives.corners import with_verdicts
-from icalib.detection.primitives.families import tag_family
+from icalib.detection.primitives.tags import tag_family
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, opencv_bits

@@ -8,8 +8,6 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
 
-from icalib.detection.primitives.consistency import consistent_corners, largest_group
-from icalib.detection.primitives.crossing_model import fit_crossing
 from icalib.detection.primitives.decoding import (
     bilinear,
     lookup,
@@ -20,7 +18,8 @@ from icalib.detection.primitives.decoding import (
     visible_cells,
 )
 from icalib.detection.primitives.edge_model import fit_corners, fit_step, solve_small
-from icalib.detection.primitives.growth import fit_homography
+from icalib.detection.primitives.growth import consistent_corners, fit_homography, largest_group
+from icalib.detection.primitives.saddles import fit_crossing
 
 H_TRUE = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.02, -0.03, 1.0]])
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from icalib.detection import what_is_seen
-from icalib.detection.boards.board_diagnosis import other_columns, other_size
 from icalib.detection.boards.detectors import detector_of
-from icalib.detection.boards.diagnosis import with_other_layout
+from icalib.detection.boards.diagnosis import other_columns, other_size, with_other_layout
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
 from icalib.geometry.targets.pattern import pattern_of

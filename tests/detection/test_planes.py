@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.detection.planes.planes import PlaneSearch, find_planes
+from icalib.detection.planes import PlaneSearch, find_planes
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, simulate
 

@@ -12,7 +12,7 @@ from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection.boards.detectors import detector_of
-from icalib.detection.primitives import quads
+from icalib.detection.primitives import tags as quads
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.sightings import sightings, without_rare_tags
 from icalib.errors import RecordingError

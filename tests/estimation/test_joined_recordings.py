@@ -10,7 +10,7 @@ from tests.typed import not_none
 
 from icalib.data.joining import PAUSE_NS, join
 from icalib.data.measurements import Measurements
-from icalib.data.recordings.several import naming, open_all
+from icalib.data.recordings.opening import naming, open_all
 from icalib.errors import RecordingError
 from icalib.estimate.problem.assembly import assemble
 from icalib.estimate.problem.inputs import inputs_for
@@ -22,8 +22,7 @@ from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_noise import NoiseModel
-from icalib.sensors.camera.initialize.initial_state import initial_state
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses
+from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
 from icalib.sensors.camera.model import MODEL
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed

@@ -9,7 +9,7 @@ import pytest
 from scipy.stats import chi2
 from tests.typed import not_none
 
-from icalib.detection.planes.planes import PlaneSearch, find_planes
+from icalib.detection.planes import PlaneSearch, find_planes
 from icalib.estimate.problem.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.state import make_layout

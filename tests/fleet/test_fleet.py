@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from icalib.base.result_files import COMMIT
+from icalib.base.files import COMMIT
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.geometry.euler import rpy, rpy_std

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from icalib.geometry import so3
-from icalib.geometry.cameras import camera_model, lens_bundle
-from icalib.geometry.cameras.lens_bundle import ImagePoints, _linearised, adjust, initial_parameters
+from icalib.geometry.cameras import camera_model
+from icalib.geometry.cameras import convert as lens_bundle
+from icalib.geometry.cameras.convert import ImagePoints, _linearised, adjust, initial_parameters
 
 RADTAN = np.array([460.0, 458.0, 371.0, 245.0, -0.28, 0.07, 2e-4, -1e-4])
 NEAR = (0.14, 0.2)

@@ -10,7 +10,7 @@ import pytest
 from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
 from icalib.initialize.assumed_motion import MIN_KEYFRAME_SPACING_S, keyframe_spacing
-from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.initializer import SmoothMotion
 from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
 from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.sensors.pose.initialize.initial_noise import pose_noise

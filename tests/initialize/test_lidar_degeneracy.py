@@ -9,13 +9,13 @@ import pytest
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.sensors.lidar.initialize.degeneracy import (
+from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
+from icalib.sensors.lidar.initialize.voxel_map import (
     count_directions,
     explaining_degeneracy,
     n_directions,
     normal_shares,
 )
-from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
 
 
 def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:

@@ -15,8 +15,7 @@ from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.trajectories.imu_trajectory import ImuTrajectory, SignalIntegrals
 from icalib.initialize.trajectories.lever_arm_rows import system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
-from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
-from icalib.sensors.lidar.initialize.registration import (
+from icalib.sensors.lidar.initialize.odometry import (
     ACCELERATION_SIGMA,
     ANGULAR_ACCELERATION_SIGMA,
     GYRO_RATE_SIGMA,
@@ -27,7 +26,9 @@ from icalib.sensors.lidar.initialize.registration import (
     STEP_ROTATION_SIGMA,
     PosePrediction,
     add_prediction,
+    lidar_trajectory,
     predicted_pose,
+    sampled_scans,
 )
 from icalib.sensors.lidar.initialize.voxel_map import ScanPose, VoxelMap, accumulate_scan, corrected_pose, insert
 

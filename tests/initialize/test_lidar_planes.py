@@ -12,7 +12,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.tolerances import specs_of, tolerance_of
-from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess
+from icalib.initialize.trajectories.trajectory_fit import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.keyframe_placement import place_keyframes
 from icalib.motion.sweep import EstimatedMotion
@@ -21,8 +21,7 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, round_search
-from icalib.sensors.lidar.initialize.association_rounds import check_shares
+from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, check_shares, round_search
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.residual import LidarFactor
 

@@ -10,9 +10,8 @@ import pytest
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.motion.plane_association import PlaneAssociation
 from icalib.pipeline import calibrate_measurements
-from icalib.sensors.lidar.initialize import association, association_rounds
-from icalib.sensors.lidar.initialize.association import AssociatedPlanes, odd_step
-from icalib.sensors.lidar.initialize.association_rounds import _first_points, _unthinned
+from icalib.sensors.lidar.initialize import association
+from icalib.sensors.lidar.initialize.association import AssociatedPlanes, _first_points, _unthinned, odd_step
 from icalib.tools.simulation import rig_for
 
 pytestmark = pytest.mark.slow
@@ -61,7 +60,7 @@ def test_the_result_is_that_of_all_points(robot, monkeypatch):
 
     recordings, rig = [raw(s.measurements) for s in sims], rig_for(sims[0].scenario)
     whole = calibrate_measurements(rig, recordings)
-    monkeypatch.setattr(association_rounds, "odd_step", lambda points: 7)
+    monkeypatch.setattr(association, "odd_step", lambda points: 7)
     thinned = calibrate_measurements(rig, recordings)
     assert whole.converged and thinned.converged
     counts = [c.lidar_residuals[0].points_used for c in (whole, thinned)]

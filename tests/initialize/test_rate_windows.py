@@ -6,8 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.initialize.steps.rate_windows import rate_window, rotation_noise, window_rates
-from icalib.initialize.steps.smooth_trajectory import MIN_HALF_WINDOW_S, smooth_trajectory
+from icalib.initialize.steps.smooth_trajectory import (
+    MIN_HALF_WINDOW_S,
+    rate_window,
+    rotation_noise,
+    smooth_trajectory,
+    window_rates,
+)
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):

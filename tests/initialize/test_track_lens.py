@@ -19,9 +19,9 @@ from icalib.sensors.camera.initialize.tracks.epipolar_rotation import (
     direction_for_rotation,
     rotation_information,
 )
+from icalib.sensors.camera.initialize.tracks.joint_alignment import track_rates
 from icalib.sensors.camera.initialize.tracks.track_intrinsics import find_intrinsics
-from icalib.sensors.camera.initialize.tracks.track_rates import track_rates
-from icalib.tools.montecarlo.truth import error, true_value
+from icalib.tools.montecarlo.one_run import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

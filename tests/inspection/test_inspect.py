@@ -16,9 +16,8 @@ from rich.console import Console
 from icalib.cli import main
 from icalib.data.recordings import FolderRecording, TopicInfo
 from icalib.geometry.targets import AprilGrid, Markers, Target
-from icalib.sensors.camera.inspect.facts import CameraSource, camera_views
+from icalib.sensors.camera.inspect.facts import CameraSource, camera_views, coverage, target_view
 from icalib.sensors.camera.inspect.findings import empty_borders
-from icalib.sensors.camera.inspect.views import coverage, target_view
 from icalib.tools.inspection import Inspection, inspect_recording, read_target
 from icalib.tools.inspection.console import print_inspection
 from icalib.tools.inspection.findings import findings

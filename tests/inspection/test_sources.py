@@ -9,7 +9,7 @@ import pytest
 from icalib.data.recordings import TopicInfo
 from icalib.data.topics import message_types
 from icalib.sensors.camera.inspect.facts import CameraSource
-from icalib.tools.inspection.sources import find_sources
+from icalib.tools.inspection import find_sources
 
 
 def topics(*names: str) -> list[TopicInfo]:

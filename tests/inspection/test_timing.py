@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.tools.inspection.timing import overlap_s, timing_of
+from icalib.tools.inspection.facts import overlap_s, timing_of
 
 STEP = 50_000_000
 

@@ -18,8 +18,7 @@ from icalib.tools.montecarlo import study as study_module
 from icalib.tools.montecarlo.console import table
 from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.reproduce import FOLDER, MOTIONS
-from icalib.tools.montecarlo.summary import summarise
-from icalib.tools.montecarlo.words import block_row
+from icalib.tools.montecarlo.summary import block_row, summarise
 from icalib.tools.simulation import load_scenario
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
@@ -117,7 +116,7 @@ def test_a_folder_that_cannot_be_written(tmp_path: Path, capsys):
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense://1"])
 def test_no_scheduler_answers(tmp_path: Path, capsys, monkeypatch, address: str):
-    monkeypatch.setattr("icalib.tools.batch.workers.ANSWER_WITHIN_S", 1)
+    monkeypatch.setattr("icalib.tools.batch.ANSWER_WITHIN_S", 1)
     arguments = ("montecarlo", str(SCENARIO), "--runs", "1", "-o", str(tmp_path), "--scheduler", address)
     assert f"no Dask scheduler answers at {address}; start one" in sentence(capsys, *arguments)
 

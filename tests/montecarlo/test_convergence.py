@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.tools.montecarlo.convergence import plotly_figure, png, rows
 from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo.reproduce import plotly_figure, png, rows
 
 
 def test_curves_are_the_errors_of_the_path_in_shown_units(record):

@@ -18,10 +18,8 @@ from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo import one_run
-from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, run
+from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, error, run, true_value, whiteness
 from icalib.tools.montecarlo.record import RunRecord
-from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.montecarlo.whiteness import whiteness
 from icalib.tools.simulation import (
     HandheldMotion,
     Room,

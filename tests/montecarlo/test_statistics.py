@@ -7,7 +7,7 @@ import pytest
 from scipy import linalg, stats
 from scipy.spatial.distance import mahalanobis
 
-from icalib.tools.montecarlo.statistics import Sample, largest, nees, spread
+from icalib.tools.montecarlo.summary import Sample, largest, nees, spread
 
 
 def drawn(runs: int, n: int, optimism: float = 1.0, seed: int = 0) -> list[Sample]:

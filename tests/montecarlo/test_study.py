@@ -19,7 +19,7 @@ from icalib.errors import CalibrationError
 from icalib.tools.montecarlo import RunRecord, RunTask, Study, StudyPlan, run_study
 from icalib.tools.montecarlo import study as study_module
 from icalib.tools.montecarlo.store import Identity, RunStore
-from icalib.tools.montecarlo.workers import run_all
+from icalib.tools.montecarlo.study import run_all
 from icalib.tools.simulation import Scenario, handheld
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,15 @@ import pytest
 from icalib.tools.montecarlo.page import study_html
 from icalib.tools.montecarlo.record import RunRecord, Size, from_json, to_json
 from icalib.tools.montecarlo.store import Identity
-from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.tools.montecarlo.words import answer, largest_words, unobservable_words, verdict_words
+from icalib.tools.montecarlo.summary import (
+    Consistency,
+    answer,
+    consistency_json,
+    largest_words,
+    summarise,
+    unobservable_words,
+    verdict_words,
+)
 
 KEYS = ("cam0.rotation", "cam0.time_offset", "cam0.distortion", "cam1.rotation", "cam1.distortion", "wheel0.radii")
 

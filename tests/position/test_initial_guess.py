@@ -18,8 +18,8 @@ from icalib.motion.sweep import EstimatedMotion
 from icalib.optim.state import State
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.position.frame import PositionFrame
+from icalib.sensors.position.initialize import KnownPlace, place
 from icalib.sensors.position.initialize.attitude import Fix
-from icalib.sensors.position.initialize.placed import KnownPlace, place
 from icalib.sensors.position.initialize.with_imu import motion_from_fixes
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.position.stream import PositionStream

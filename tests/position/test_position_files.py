@@ -13,20 +13,20 @@ from icalib.data.recordings import open_recording
 from icalib.data.recordings.base import Reading
 from icalib.errors import RecordingError
 from icalib.rig import Rig, by_name
-from icalib.sensors.position.read import read
-from icalib.sensors.position.read.checks import checked_positions
-from icalib.sensors.position.read.messages import from_navsat, from_positions
+from icalib.sensors.position.read import checked_positions, read
 from icalib.sensors.position.read.readings import (
     AS_RECORDED,
     NO_COVARIANCE,
     PositionReadings,
     about_first,
     from_geodetic,
+    from_navsat,
+    from_positions,
     good_fixes,
     left_out,
+    read_position_table,
 )
 from icalib.sensors.position.read.rtklib import read_pos
-from icalib.sensors.position.read.tables import read_position_table
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TableLayout

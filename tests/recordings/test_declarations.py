@@ -10,10 +10,9 @@ import pytest
 
 from icalib.data import topics
 from icalib.data.recordings import FolderRecording, open_recording
-from icalib.data.tables import files
+from icalib.data.tables import table as files
 from icalib.data.tables.columns import STAMP, TableKind
-from icalib.data.tables.files import TableFile, table_files
-from icalib.data.tables.table import read_table
+from icalib.data.tables.table import TableFile, read_table, table_files
 from icalib.data.topics import MessageType, message_types
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.pose import read as pose

@@ -14,7 +14,7 @@ from icalib.data.recordings import FolderRecording, PictureFolder, open_recordin
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuNoise, ImuSensor
 from icalib.sensors.imu.read import readings as imu_readings
-from icalib.tools.inspection.sources import find_sources
+from icalib.tools.inspection import find_sources
 
 
 def picture(path: Path, grey: int) -> None:

@@ -11,7 +11,7 @@ import pytest
 from icalib.cli import main
 from icalib.data.measurements import LidarStream
 from icalib.data.recordings import FolderRecording, open_recording
-from icalib.data.recordings.reading import read_measurements
+from icalib.data.recordings.opening import read_measurements
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig

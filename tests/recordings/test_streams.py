@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.typed import random_rotations
 
-from icalib.data.messages.streams import read_odometry, read_poses, read_twists
+from icalib.data.messages import read_odometry, read_poses, read_twists
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.sensors.camera.read.camera_info import read_camera_info

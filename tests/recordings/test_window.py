@@ -14,7 +14,7 @@ from tests.typed import instance
 from icalib.cli import main
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
-from icalib.data.recordings.several import open_all
+from icalib.data.recordings.opening import open_all
 from icalib.data.stamps.window import Window, start_of
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate

@@ -17,12 +17,11 @@ import yaml
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from icalib.base.own_files import sealed_texts
+from icalib.base.files import sealed_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.export.common import guesses, quaternion
-from icalib.export.formats import export
-from icalib.export.names import FORMATS
+from icalib.export.formats import FORMATS, export
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_model import correction_matrices
 from icalib.result import Calibration, ParameterGroup

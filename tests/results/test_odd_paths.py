@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from tests.allan.test_allan import at_rest
 
-from icalib.base.text_files import printable
+from icalib.base.files import printable
 from icalib.cli import main
 from icalib.export.formats import export
 from icalib.export.outputs import write_outputs

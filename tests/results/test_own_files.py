@@ -13,11 +13,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.base.file_names import below
-from icalib.base.own_files import is_ours, refuse_foreign, sealed
-from icalib.base.result_files import COMMIT, read_file, refuse_foreign_set, write_files
-from icalib.base.staging import PREFIX, staged
-from icalib.base.text_files import write_texts
+from icalib.base.files import (
+    COMMIT,
+    PREFIX,
+    below,
+    is_ours,
+    read_file,
+    refuse_foreign,
+    refuse_foreign_set,
+    sealed,
+    staged,
+    write_files,
+    write_texts,
+)
 from icalib.cli import main
 from icalib.errors import CalibrationError
 
@@ -131,7 +139,7 @@ def test_a_linked_commit_folder_moves_nothing(tmp_path: Path):
 KILLED = """
 import sys, time
 from pathlib import Path
-from icalib.base.staging import staged
+from icalib.base.files import staged
 with staged(Path(sys.argv[1])) as place:
     (place / "half").write_bytes(b"half")
     print(place, flush=True)

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.base.own_files import is_ours, sealed_texts
+from icalib.base.files import is_ours, sealed_texts
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.export.formats import export

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from icalib.base.result_files import COMMIT, check_writable, read_file, write_files
+from icalib.base.files import COMMIT, check_writable, read_file, write_files
 from icalib.errors import CalibrationError
 
 NAMES = ("calibration.yaml", "result.json", "result.npz")
@@ -82,7 +82,7 @@ def test_a_full_disk_leaves_the_old_set(tmp_path: Path, monkeypatch: pytest.Monk
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr("icalib.base.result_files.os.fsync", full)
+        patch.setattr("icalib.base.files.os.fsync", full)
         with pytest.raises(CalibrationError, match="No space left on device"):
             write_files(tmp_path, NEW)
     assert contents(tmp_path) == OLD

@@ -20,7 +20,7 @@ from icalib.result import (
     working_distance,
 )
 from icalib.sensors.camera.record import TrackResiduals
-from icalib.tools.montecarlo.whiteness import whiteness
+from icalib.tools.montecarlo.one_run import whiteness
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow

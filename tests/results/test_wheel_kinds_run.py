@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from icalib.cli import main
-from icalib.export.names import FORMATS
+from icalib.export.formats import FORMATS
 from icalib.geometry.targets import AprilGrid
 from icalib.result import load_calibration
 from icalib.rig import Ground

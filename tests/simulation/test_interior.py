@@ -21,8 +21,7 @@ from icalib.tools.simulation import (
     hills_of_slope,
 )
 from icalib.tools.simulation.images.interior import Interior, RoomRenderer
-from icalib.tools.simulation.images.lenses import unproject
-from icalib.tools.simulation.images.raster import pixel_kernel, shrink
+from icalib.tools.simulation.images.rendering import pixel_kernel, shrink, unproject
 from icalib.tools.simulation.scenario.image_faults import faults_of
 from icalib.tools.simulation.scenario.projection import project
 from icalib.tools.simulation.scenario.room import distances

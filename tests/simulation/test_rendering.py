@@ -13,8 +13,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of
 from icalib.tools.simulation import handheld, simulate
-from icalib.tools.simulation.images.lenses import unproject
-from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses
+from icalib.tools.simulation.images.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses, unproject
 from icalib.tools.simulation.scenario.projection import project
 from icalib.tools.simulation.scenario.scenario import SimCamera
 

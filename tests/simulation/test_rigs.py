@@ -27,13 +27,13 @@ EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"
 ALLOWED = (
     "icalib.errors",
     "icalib.base.extras",
-    "icalib.base.file_names",
+    "icalib.base.files",
     "icalib.data.measurements",
     "icalib.rig",
     "icalib.sensors.sensor",
     "icalib.geometry.targets",
     "icalib.tools.simulation",
-    "icalib.base.staging",
+    "icalib.base.files",
     "icalib.base.yaml_nodes",
 )
 

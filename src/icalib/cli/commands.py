@@ -298,13 +298,11 @@ def _fleet(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from icalib.base.own_files import refuse_foreign
-    from icalib.base.text_files import write_sealed
+    from icalib.base.files import refuse_foreign, write_sealed
     from icalib.cli.console import progress_bar
     from icalib.tools.inspection import draft_rig, inspect_recording, read_target, write_draft
-    from icalib.tools.inspection.console import print_inspection
+    from icalib.tools.inspection.console import figures_json, print_inspection
     from icalib.tools.inspection.draft import check_draft
-    from icalib.tools.inspection.figures import figures_json
 
     if options.rig:
         check_draft(options.rig)

@@ -43,8 +43,7 @@ def _add_allan(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 def _allan(options: argparse.Namespace) -> None:
     from icalib.tools.allan import study_recording, write_study
-    from icalib.tools.allan.files import check_folder
-    from icalib.tools.allan.words import print_study
+    from icalib.tools.allan.files import check_folder, print_study
 
     check_folder(options.output)
     study = study_recording(options.recording, options.imu, options.gyro_unit, options.accel_unit)
@@ -55,7 +54,7 @@ def _allan(options: argparse.Namespace) -> None:
 
 
 def _add_export(commands: argparse._SubParsersAction[CommandParser]) -> None:
-    from icalib.export.names import FORMATS, FRAMED, ONE_FILE
+    from icalib.export.formats import FORMATS, FRAMED, ONE_FILE
 
     about = "write a result as files of other programs"
     c = add_command(
@@ -86,11 +85,8 @@ def _pair(text: str) -> tuple[str, str]:
 
 
 def _export(options: argparse.Namespace) -> None:
-    from icalib.base.own_files import refuse_foreign, sealed_texts
-    from icalib.base.result_files import set_of
-    from icalib.base.text_files import write_texts
-    from icalib.export.formats import export
-    from icalib.export.names import ONE_FILE
+    from icalib.base.files import refuse_foreign, sealed_texts, set_of, write_texts
+    from icalib.export.formats import ONE_FILE, export
     from icalib.result import load_calibration
 
     calibration = load_calibration(options.result)
@@ -131,9 +127,7 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from icalib.base.own_files import refuse_foreign
-    from icalib.base.result_files import set_of
-    from icalib.base.text_files import write_sealed
+    from icalib.base.files import refuse_foreign, set_of, write_sealed
     from icalib.cli.console import progress_bar
     from icalib.result import load_calibration
     from icalib.tools.check import check_calibration
@@ -164,9 +158,7 @@ def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _rig(options: argparse.Namespace) -> None:
-    from icalib.base.own_files import refuse_foreign
-    from icalib.base.result_files import set_of
-    from icalib.base.text_files import write_sealed
+    from icalib.base.files import refuse_foreign, set_of, write_sealed
     from icalib.result import load_calibration
     from icalib.result.as_rig import rig_text
 
@@ -221,9 +213,7 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from icalib.base.own_files import refuse_foreign
-    from icalib.base.result_files import set_of
-    from icalib.base.text_files import write_sealed
+    from icalib.base.files import refuse_foreign, set_of, write_sealed
     from icalib.tools.comparison.compare import ComparisonTolerances
     from icalib.tools.comparison.reading import compare_files
     from icalib.tools.comparison.words import comparison_json, lines
@@ -252,7 +242,7 @@ def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _view(options: argparse.Namespace) -> None:
-    from icalib.base.own_files import refuse_foreign
+    from icalib.base.files import refuse_foreign
     from icalib.cli.console import progress_bar
     from icalib.tools.view import view
 

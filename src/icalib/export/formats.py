@@ -1,26 +1,76 @@
-"""Exports a calibration to a format by its name."""
+"""Names of the export formats. They are separate from the exporters, so that the command line imports them quickly.
+
+Export to plain JSON: poses as matrices and quaternions, with standard deviations and verdicts.
+
+Exports a calibration to a format by its name.
+"""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import yaml
+
+from icalib.base.files import printable
 from icalib.base.suggestion import suggestion
 from icalib.errors import CalibrationError
-from icalib.export.autoware import autoware
 from icalib.export.colmap import colmap
-from icalib.export.common import Export, guesses, no_place_for, others
+from icalib.export.common import Export, guessed_poses, guesses, no_place_for, others, quaternion
 from icalib.export.kalibr import camchain, camchain_name, imu_yaml
 from icalib.export.lidar_odometry import fast_lio, fast_livo2, lio_sam
-from icalib.export.mins import mins
-from icalib.export.names import FORMATS, FRAMED
-from icalib.export.openvins import openvins
+from icalib.export.openvins import mins, openvins
 from icalib.export.orb_slam3 import orb_slam3
-from icalib.export.plain import plain_json
-from icalib.export.ros import camera_info, ros2_static
+from icalib.export.ros import autoware, camera_info, ros2_static
 from icalib.export.urdf import updated_urdf, urdf
 from icalib.export.vins_fusion import vins_fusion
 from icalib.result import Calibration
+from icalib.result.summary import body_name, calibration_yaml, pose_key, reference_name
+
+FORMATS = (
+    "kalibr",
+    "openvins",
+    "vins-fusion",
+    "orb-slam3",
+    "ros2-static",
+    "camera-info",
+    "urdf",
+    "autoware",
+    "mins",
+    "fast-lio",
+    "fast-livo2",
+    "lio-sam",
+    "colmap",
+    "json",
+)
+FRAMED = ("ros2-static", "urdf", "autoware")  # formats that contain names of sensor frames
+ONE_FILE = ("ros2-static", "urdf", "json")  # formats whose output path is a file, not a folder
+
+
+def plain_json(c: Calibration) -> Export:
+    """The file calibration.json: the content of calibration.yaml, with a quaternion and a translation for each
+    sensor."""
+    body, key = body_name(c), pose_key(c)
+    data: dict[str, Any] = {
+        "conventions": {
+            key: f"p_{body} = {key} p_sensor, 4 x 4, m",
+            "quaternion_xyzw": f"the rotation of {key}",
+            "translation": f"the sensor's origin in the {body} frame, m",
+            "time_offset": f"t_{reference_name(c)} = t_sensor + time_offset, s",
+            "std": f"rotation about the sensor's axes, rad; translation along those of {body}, m",
+            "relative": "T_a_b takes coordinates in the frame of b to that of a",
+        }
+    }
+    data |= yaml.safe_load(calibration_yaml(c))
+    for sensor in data["sensors"].values():
+        T = np.array(sensor[key])
+        sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}
+    return Export(
+        {"calibration.json": printable(json.dumps(data, indent=1, ensure_ascii=False)) + "\n"}, guessed_poses(c)
+    )
 
 
 def export(

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from icalib.base.own_files import sealed
-from icalib.base.result_files import check_writable, refuse_foreign_set, write_files
-from icalib.base.text_files import printable
+from icalib.base.files import check_writable, printable, refuse_foreign_set, sealed, write_files
 from icalib.export.kalibr import kalibr_texts
 from icalib.report import report_html
 from icalib.result import Calibration, calibration_files

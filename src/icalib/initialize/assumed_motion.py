@@ -31,10 +31,11 @@ from icalib.initialize.hosts_on_odometry import (
     with_pose_sensor,
     with_stated_values,
 )
-from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
+from icalib.initialize.steps.contradicted_guesses import MotionContradictedError, stated_values
 from icalib.initialize.steps.initializer import (
     InitialGuess,
     Initializer,
+    SmoothMotion,
     Values,
     initializer_of,
     keyframe_hosts,
@@ -42,8 +43,6 @@ from icalib.initialize.steps.initializer import (
     motion_kinds,
     place_sensors,
 )
-from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.initialize.steps.smooth_trajectory import MIN_PARABOLA_POSES, BodyPoses, SmoothTrajectory
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.keyframe_placement import first_keyframes

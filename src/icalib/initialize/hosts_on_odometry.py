@@ -13,9 +13,8 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.assumed_sensors import pose_sensor_for
-from icalib.initialize.steps.contradicted_guesses import merged_values
+from icalib.initialize.steps.contradicted_guesses import merged_values, stated_values
 from icalib.initialize.steps.initializer import Values, keyframe_hosts
-from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Parameter, Rig, Sensor
 from icalib.sensors.sensor import MOUNTED_NAMES

@@ -356,7 +356,7 @@ class Calibration:
         Raises CalibrationError if the folder cannot be written, or contains files of these names that icalib did not
         write.
         """
-        from icalib.base.result_files import refuse_foreign_set, write_files
+        from icalib.base.files import refuse_foreign_set, write_files
         from icalib.result.saving import calibration_files
 
         refuse_foreign_set(Path(folder))

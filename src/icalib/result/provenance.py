@@ -6,7 +6,7 @@ import platform
 from importlib.metadata import version
 from pathlib import Path
 
-from icalib.base.file_hashes import hash_of
+from icalib.base.input_files import hash_of
 
 _LIBRARIES = ("numpy", "numba")
 

@@ -12,11 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from icalib.base.file_names import NAME
-from icalib.base.own_files import sealed
-from icalib.base.result_files import read_file
-from icalib.base.text_files import printable
-from icalib.base.unpacking import load_arrays
+from icalib.base.files import NAME, printable, read_file, sealed
+from icalib.base.input_files import load_arrays
 from icalib.errors import CalibrationError
 from icalib.result.calibration import (
     Calibration,

@@ -8,9 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.base.extras import install
-from icalib.base.own_files import refuse_foreign, sealed
-from icalib.base.staging import staged
-from icalib.base.writing import writing
+from icalib.base.files import refuse_foreign, sealed, staged, writing
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
 from icalib.geometry.targets.pattern import Pattern, pattern_of

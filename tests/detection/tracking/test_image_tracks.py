@@ -9,7 +9,7 @@ import pytest
 from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
-from icalib.detection.images import image_work
+from icalib.detection import images as image_work
 from icalib.errors import RecordingError
 from icalib.rig import Camera
 from icalib.sensors.camera.read import image_tracks

@@ -8,8 +8,7 @@ from typing import BinaryIO, final
 
 import numpy as np
 
-from icalib.data.bags.spans import DamageError, Span, SpanStorage
-from icalib.data.bags.storage import Connection, Tally, full_type
+from icalib.data.bags.storage import Connection, DamageError, Span, SpanStorage, Tally, full_type
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX = 2, 3, 4, 5, 6, 7

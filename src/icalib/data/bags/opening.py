@@ -9,14 +9,12 @@ import weakref
 from pathlib import Path
 
 from icalib.base.extras import load_zstd
-from icalib.base.file_hashes import HashedFile
-from icalib.base.unpacking import TooLargeError, copy_unpacked
+from icalib.base.input_files import HEAD_BYTES, HashedFile, TooLargeError, copy_unpacked, not_data
 from icalib.base.yaml_nodes import read_yaml
 from icalib.data.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.data.bags.ros1 import ROS1_MAGIC, Ros1Storage
 from icalib.data.bags.sqlite import SQLITE_MAGIC, SqliteStorage
 from icalib.data.bags.storage import Storage
-from icalib.data.images.unreadable import HEAD_BYTES, not_data
 from icalib.errors import RecordingError, RigError
 
 _READERS = {ROS1_MAGIC: Ros1Storage, MCAP_MAGIC: McapStorage, SQLITE_MAGIC: SqliteStorage}

@@ -8,8 +8,7 @@ from typing import BinaryIO, final
 
 import numpy as np
 
-from icalib.data.bags.spans import DamageError, Span, SpanStorage
-from icalib.data.bags.storage import Connection, Tally, full_type
+from icalib.data.bags.storage import Connection, DamageError, Span, SpanStorage, Tally, full_type
 from icalib.errors import RecordingError
 
 ROS1_MAGIC = b"#ROSBAG V"

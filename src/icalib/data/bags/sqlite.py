@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import final
 
-from icalib.base.file_hashes import hash_of
+from icalib.base.input_files import hash_of
 from icalib.data.bags.storage import Connection, Tally, cut_note, full_type
 from icalib.errors import RecordingError
 

@@ -4,9 +4,8 @@ from icalib.data.images.images import DamagedImageError, DecodedImage, Payload, 
 from icalib.data.recordings.bag import BagRecording
 from icalib.data.recordings.base import Recording
 from icalib.data.recordings.folder import FolderRecording
-from icalib.data.recordings.opening import open_recording
+from icalib.data.recordings.opening import open_recording, read_measurements
 from icalib.data.recordings.pictures import PictureFolder
-from icalib.data.recordings.reading import read_measurements
 from icalib.data.topics import TopicInfo
 
 __all__ = [

@@ -11,7 +11,7 @@ from typing import Any, final
 import numpy as np
 
 from icalib.base.extras import load_typesys, load_zstd
-from icalib.base.unpacking import unpacked
+from icalib.base.input_files import unpacked
 from icalib.data.bags.opening import ZSTD_MAGIC, open_storages
 from icalib.data.bags.storage import Tally
 from icalib.data.images.image_checks import checked_payloads

@@ -9,15 +9,22 @@ from typing import final
 
 import numpy as np
 
-from icalib.data.images.euroc_images import file_payloads, image_files
+from icalib.base.input_files import VIDEO_FILE
 from icalib.data.images.image_checks import Note, checked_payloads, ignore
+from icalib.data.images.image_files import (
+    file_payloads,
+    image_files,
+    stamp_table,
+    video_payloads,
+    video_stamps,
+    video_topic,
+    videos_in,
+)
 from icalib.data.images.images import Payload
-from icalib.data.images.unreadable import VIDEO_FILE
-from icalib.data.images.videos import stamp_table, video_payloads, video_stamps, video_topic, videos_in
 from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window
-from icalib.data.tables.files import StampsOfRows, TableFile, files_in, named_tables, rows_of
 from icalib.data.tables.numbered import numbered_pictures, stamped_by_rows
+from icalib.data.tables.table import StampsOfRows, TableFile, files_in, named_tables, rows_of
 from icalib.data.topics import TopicInfo, choose_topic, find_topic
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout

@@ -1,19 +1,33 @@
-"""Opens a recording: detects its format and chooses the reader."""
+"""Opens a recording: detects its format and chooses the reader.
+
+Opens several recordings of a rig under unique names; adds names and notes to errors. Reads and checks the measurements
+of all sensors of a rig from a recording.
+"""
 
 from __future__ import annotations
 
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 from math import inf
 from pathlib import Path
 
+from icalib.base.input_files import HEAD_BYTES, is_video, not_data
 from icalib.data.bags.opening import bag_files
-from icalib.data.images.unreadable import HEAD_BYTES, is_video, not_data
+from icalib.data.measurements import Measurements
 from icalib.data.recordings.bag import BagRecording
-from icalib.data.recordings.base import Recording
+from icalib.data.recordings.base import Progress, Reading, Recording
 from icalib.data.recordings.folder import FolderRecording
 from icalib.data.recordings.pictures import PictureFolder, has_pictures
+from icalib.data.stamps.jumps import LONGEST_S, ClockJumps
+from icalib.data.stamps.sections import S
 from icalib.data.stamps.window import Window
-from icalib.data.tables.files import named_tables, table_files
-from icalib.errors import RecordingError
+from icalib.data.tables.table import named_tables, table_files
+from icalib.errors import CalibrationError, RecordingError
+from icalib.rig import Rig
+from icalib.sensors import SENSOR_KINDS, facet
 
 _MAX_LISTED = 12
 _OF_TABLES = ("*/*.csv", "*/*.csv.gz", "mav0", "*/data")
@@ -60,3 +74,89 @@ def _holds_bags(folder: Path) -> bool:
 def _holds_tables(folder: Path) -> bool:
     patterns = (*_OF_TABLES, *(f"*/{table.name}" for table in table_files()))
     return any(p for pattern in patterns for p in folder.glob(pattern)) or bool(named_tables(folder))
+
+
+Source = Recording | str | Path
+
+
+def open_all(given: Source | Sequence[Source], start_s: float = 0.0, end_s: float = inf) -> dict[str, Recording]:
+    """Opened recordings by name: the name of the file or folder, or the whole path if two share the name.
+
+    An already opened `Recording` is numbered. start_s, end_s: time window of each, as in `open_recording`. Raises
+    RecordingError for no recording, an unreadable one, a path given twice, and a time window with an opened
+    `Recording`.
+    """
+    sources: Sequence[Source] = given if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    if not sources:
+        raise RecordingError("no recording was given; give at least one.")
+    paths = [Path(s).resolve() for s in sources if isinstance(s, (str, Path))]
+    twice = [path for path, count in Counter(paths).items() if count > 1]
+    if twice:
+        raise RecordingError(f"the recording {twice[0]} is given twice; give each recording once.")
+    names = Counter(path.name for path in paths)
+    opened: dict[str, Recording] = {}
+    for k, source in enumerate(sources, 1):
+        if isinstance(source, (str, Path)):
+            path = Path(source).resolve()
+            opened[path.name if names[path.name] == 1 else str(path)] = open_recording(source, start_s, end_s)
+        elif (start_s, end_s) != (0.0, inf):
+            raise RecordingError("start_s and end_s do not apply to an opened recording; give them to open_recording.")
+        else:
+            opened[f"recording {k}"] = source
+    return opened
+
+
+@contextmanager
+def naming(name: str) -> Iterator[None]:
+    """Context manager: prefixes errors raised within by `name`, unless it is empty or the message contains it."""
+    try:
+        yield
+    except CalibrationError as error:
+        if not name or re.search(rf"(^|[/\\]){re.escape(name)}\b", str(error)):
+            raise
+        raise type(error)(f"{name}: {error}") from error
+
+
+@contextmanager
+def noting(notes: Iterable[str]) -> Iterator[None]:
+    """Context manager: adds `notes` on rejected or repaired data, a possible cause, to `__notes__` of errors raised
+    within."""
+    try:
+        yield
+    except CalibrationError as error:
+        for note in dict.fromkeys(notes):
+            error.add_note(note)
+        raise
+
+
+def read_measurements(recording: Recording, rig: Rig, progress: Progress = lambda *_: None) -> Measurements:
+    """Read and check the streams of all sensors of `rig` from `recording`. If a sensor recorded images, target corners
+    or feature tracks are detected in them.
+
+    Clock jumps split a stream; one segment is used. Notes list rejected data. Raises RecordingError, naming the file
+    and line or instant, for data that are missing, unreadable, unordered, in wrong units, or not of this rig.
+    """
+    progress("reading", 0.0)
+    recording.use_layouts(tuple(rig.sensors.values()))
+    jumps = ClockJumps(LONGEST_S)
+    reading = Reading(rig, _uncut if rig.cameras_alone else jumps.cut, progress)
+    streams = []
+    for kind in SENSOR_KINDS:
+        sensors = [s for s in rig.sensors.values() if s.sensor_type == kind]
+        streams += facet(kind, "read").read(recording, sensors, reading) if sensors else []
+    notes = sum((sentences for _, sentences in streams), recording.notes() + jumps.notes)
+    return Measurements.of_streams(*(stream for stream, _ in streams), notes=notes)
+
+
+def without_jumps(rig: Rig, measurements: Measurements) -> Measurements:
+    """Measurements in memory without clock jumps, as `read_measurements` removes them from files."""
+    m, jumps = measurements, ClockJumps(LONGEST_S)
+    if rig.cameras_alone:  # stamps only match images of different cameras
+        return m
+    streams = {key: jumps.cut(s, s.name) for key, s in m.streams.items()}
+    return replace(m, streams=streams, notes=m.notes + jumps.notes) if jumps.notes else m
+
+
+def _uncut(stream: S, what: str) -> S:
+    del what
+    return stream

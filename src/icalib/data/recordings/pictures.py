@@ -13,8 +13,8 @@ from typing import final
 
 import numpy as np
 
-from icalib.data.images.euroc_images import SUFFIXES, file_payloads, pictures_in, stamped_by_name
 from icalib.data.images.image_checks import checked_payloads
+from icalib.data.images.image_files import SUFFIXES, file_payloads, pictures_in, stamped_by_name
 from icalib.data.images.images import Payload
 from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window

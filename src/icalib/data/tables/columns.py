@@ -1,4 +1,7 @@
-"""Identification of the columns of a table: by the names in its header, by the rig file, or by their order."""
+"""Identification of the columns of a table: by the names in its header, by the rig file, or by their order.
+
+Permutation and signs of vector components as the rig file states.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.data.tables.table_kernels import LEFT_OUT
-from icalib.rig import TimeUnit
+from icalib.rig import Axes, TimeUnit
 
 _UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
@@ -135,3 +138,12 @@ def _plain(name: str) -> str:
     while prefix := _FROM.match(plain):
         plain = plain[prefix.end() :]
     return plain
+
+
+def in_axes(values: np.ndarray, axes: Axes | None) -> np.ndarray:
+    """Vectors (N, 3) with components reordered and negated by `axes`, the source components of x, y and z, such as
+    ("y", "-x", "z"). Unchanged if `axes` is None."""
+    if axes is None:
+        return values
+    columns = ["xyz".index(entry[-1]) for entry in axes]
+    return values[:, columns] * [-1.0 if entry.startswith("-") else 1.0 for entry in axes]

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.images.euroc_images import pictures_in, stamped_by_name
 from icalib.data.images.image_checks import Note
+from icalib.data.images.image_files import pictures_in, stamped_by_name
 from icalib.data.stamps.clocks import is_rate
 from icalib.errors import RecordingError
 

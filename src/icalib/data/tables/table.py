@@ -1,26 +1,29 @@
-"""Reader of numeric text tables (CSV, also gzip): exact integers and stamps, fast floats."""
+"""Reader of numeric text tables (CSV, also gzip): exact integers and stamps, fast floats.
+
+Table files of folder recordings, as each kind of sensor declares them in its `read` module.
+"""
 
 from __future__ import annotations
 
 import gzip
 import re
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache
 from math import isfinite
 from pathlib import Path
 
 import numpy as np
 
-from icalib.base.file_hashes import hash_of
-from icalib.base.unpacking import TooLargeError, gunzipped
+from icalib.base.input_files import HEAD_BYTES, TooLargeError, gunzipped, hash_of, not_data
 from icalib.data.images.image_checks import Note, ignore
-from icalib.data.images.unreadable import HEAD_BYTES, not_data
 from icalib.data.stamps.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
 from icalib.data.tables.columns import TableKind, contradicts, places_by_name, places_given, split_kind
 from icalib.data.tables.table_kernels import LEFT_OUT, POWERS, parse
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
+from icalib.sensors import SENSOR_KINDS, facet
 
 _GZIP_MAGIC = b"\x1f\x8b"
 _SEPARATORS = (",", ";", "\t", None)  # None: whitespace
@@ -299,3 +302,61 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
         hint = " (stamps in seconds are `time_unit: s` in the rig file)" if name.endswith("[ns]") else ""
         return f"{spot}: {name} is {excerpt}, but must be a whole number below 2^63{hint}; correct the line."
     return f"{spot}: {name} is {excerpt!r}, which is not written as a plain decimal number; correct the line."
+
+
+StampsOfRows = Callable[[Path, TableLayout, Callable[[str], None]], tuple[dict[int, int], int]]
+
+
+@dataclass(frozen=True)
+class TableFile:
+    """Declaration of a table file in the folder of a sensor.
+
+    name: file name or pattern; a compressed file with the additional suffix .gz also matches. type, kind: as of
+    `TopicInfo`. stamps: function that reads its stamps, (N,) int64 ns, with a layout of the rig file. holds: function
+    that tells from the content whether a file is of this type; None: it is, unless `holds` of another declaration is
+    true. beside: columns that identify a table of this type outside of sensor folders by its header; None: no such
+    table. rows: function that returns stamps [ns] by row number and the number of rows, if images without timestamps
+    may take the stamps of rows.
+    """
+
+    name: str
+    type: str
+    kind: str
+    stamps: Callable[[Path, TableLayout], np.ndarray]
+    holds: Callable[[Path], bool] | None = None
+    beside: TableKind | None = None
+    rows: StampsOfRows | None = None
+
+
+@cache
+def table_files() -> tuple[TableFile, ...]:
+    """Declarations of all kinds of sensors."""
+    return tuple(t for kind in SENSOR_KINDS for t in facet(kind, "read").TABLES)
+
+
+def rows_of(sensor_type: str) -> TableFile | None:
+    """The declaration with `rows` of a sensor type, for images without timestamps; None if there is none."""
+    return next((t for t in facet(sensor_type, "read").TABLES if t.rows is not None), None)
+
+
+def named_tables(folder: Path) -> list[tuple[Path, TableFile]]:
+    """CSV files directly in `folder` whose header names the columns `beside` of a declaration, with the declaration."""
+    declared = [t for t in table_files() if t.beside is not None]
+    declarations = {}
+    for path in sorted(folder.glob("*.csv")):
+        table = next((t for t in declared if t.beside is not None and named(path, t.beside)), None)
+        if table is not None:
+            declarations[path] = table
+    return list(declarations.items())
+
+
+def files_in(folder: Path) -> list[tuple[Path, TableFile]]:
+    """Declared files in the folder of a sensor, each with its declaration, in the order of `table_files`."""
+    declarations: dict[Path, TableFile] = {}
+    for table in table_files():
+        for path in sorted({p for name in (table.name, f"{table.name}.gz") for p in folder.glob(name) if p.is_file()}):
+            if table.holds is None:
+                declarations.setdefault(path, table)
+            elif table.holds(path):
+                declarations[path] = table
+    return list(declarations.items())

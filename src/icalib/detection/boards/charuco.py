@@ -7,15 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.detection.boards.markers import all_tags
-from icalib.detection.primitives.consistency import largest_group
+from icalib.detection.boards.aprilgrid import all_tags
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.decoding import mapped
-from icalib.detection.primitives.families import Family, tag_family
-from icalib.detection.primitives.growth import decoded_markers, fit_homography, homography_misfit
+from icalib.detection.primitives.growth import decoded_markers, fit_homography, homography_misfit, largest_group
 from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
-from icalib.detection.primitives.quads import ImageWithQuads
 from icalib.detection.primitives.squares import square_corners
+from icalib.detection.primitives.tags import Family, ImageWithQuads, tag_family
 from icalib.errors import RecordingError
 
 _PREDICTING_MARKERS = 4  # markers that predict a corner

@@ -1,19 +1,28 @@
-"""Checkerboards: detection of the inner corners, in an order that does not depend on the orientation of the board."""
+"""Checkerboards: detection of the inner corners, in an order that does not depend on the orientation of the board.
+
+X-corners of any pattern: whether an image shows a grid of them, and whether a grid continues beyond a board.
+
+X-corners are found by the ChESS response (Bennett and Lasenby, Computer Vision and Image Understanding 118, 2014).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import hypot
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
+from icalib.base.compiled import njit
 from icalib.base.extras import load_cv2
 from icalib.detection.primitives.corners import INCONSISTENT, ImageCorners, no_corners
-from icalib.detection.primitives.crossings import continues_beyond, shows_grid
 from icalib.detection.primitives.decoding import nearest_greys
+from icalib.detection.primitives.edge_model import USUAL_BLUR_PX
 from icalib.detection.primitives.prediction import PredictedCorners, predict_nodes
-from icalib.detection.primitives.quads import ImageWithQuads
+from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.squares import square_corners
+from icalib.detection.primitives.tags import LEAST_CONTRAST, ImageWithQuads
 from icalib.errors import RecordingError
 
 _REDUCED_PX = 1000  # larger images are first searched at a fraction of their size; only the time depends on it
@@ -166,3 +175,132 @@ def _framed(grid: np.ndarray) -> np.ndarray:
     squares."""
     grid = np.concatenate([2.0 * grid[:1] - grid[1:2], grid, 2.0 * grid[-1:] - grid[-2:-1]])
     return np.concatenate([2.0 * grid[:, :1] - grid[:, 1:2], grid, 2.0 * grid[:, -1:] - grid[:, -2:-1]], axis=1)
+
+
+# Half of the 16 samples of ChESS, (u, v) px from a pixel; the other half lies opposite.
+_RING = ((0, -5), (2, -5), (3, -3), (5, -2), (5, 0), (5, 2), (3, 3), (2, 5))
+_RING_PX = 5
+_SCALES = 3  # levels of the image pyramid; one more finds boards that are twice as blurred
+# Grey levels. A sharp corner of contrast c has up to 8 c. Doubled, a blurred board of the least contrast is missed.
+_LEAST_RESPONSE = 4 * LEAST_CONTRAST
+_PEAK_WINDOW_PX = 7  # width of the non-maximum suppression; corners less than 4 px apart merge
+_MOST_PEAKS = 500  # strongest peaks of an image that are kept; the time grows with its square
+_NEIGHBOUR_PEAKS = 8  # peaks among which a corner's grid neighbours are looked for: four, and four diagonal ones
+# Largest |p + q| / min(|p|, |q|) of two opposite neighbours at p and q from the corner: 0 without perspective and
+# distortion. If it were larger, random texture would have opposite neighbours by chance.
+_OPPOSITE = 0.25
+_LEAST_SINE = 0.3  # of the angle between rows and columns in the image, at least: 17 degrees
+_MOST_MOVE = 0.2  # of a square's side: largest distance of a corner from its extrapolated position
+_CLEAR = 0.5  # of a square's side: largest half width of the window
+_CONTINUED_SHARE = 0.5  # share of extrapolated positions beside a board with X-corners, above which the board is larger
+
+
+def shows_grid(image: np.ndarray, enough: float) -> bool:
+    """Whether the image (h, w) uint8, at full, half or quarter size, has a grid of `enough` connected X-corners."""
+    cv2 = load_cv2()
+    for _ in range(_SCALES):
+        if min(image.shape) <= 2 * _RING_PX:
+            break  # no pixel has a whole ring
+        response = _chess_response(image)
+        largest_near = cv2.dilate(response, np.ones((_PEAK_WINDOW_PX, _PEAK_WINDOW_PX)))
+        peak = (response == largest_near) & (response > _LEAST_RESPONSE)
+        at = np.argwhere(peak)
+        strongest = np.argsort(-response[peak], kind="stable")[:_MOST_PEAKS]
+        if _largest_grid(at[strongest].astype(np.float64)) >= enough:
+            return True
+        if min(image.shape) < 8 * _RING_PX:
+            break
+        image = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return False
+
+
+def _largest_grid(at: np.ndarray) -> int:
+    """Number of the points at (n, 2) px in the largest connected part of the graph of `_grid_links`."""
+    if len(at) <= _NEIGHBOUR_PEAKS:
+        return 0
+    links = _grid_links(at)
+    inner = links.any(axis=1)
+    links = links[np.ix_(inner, inner)]
+    _, group = connected_components(links | links.T, directed=False)
+    return int(np.bincount(group, minlength=1).max())
+
+
+@njit(cache=True, nogil=True)
+def _grid_links(at):
+    """(n, n) bool: [i, j] is true if point j of at (n, 2) px is a grid neighbour of point i.
+
+    A grid point has pairs of opposite neighbours in two directions. Points without two directions get no links.
+    """
+    n = len(at)
+    links, distance = np.zeros((n, n), dtype=np.bool_), np.empty(n)
+    for i in range(n):
+        for j in range(n):
+            distance[j] = hypot(at[j, 0] - at[i, 0], at[j, 1] - at[i, 1])
+        near = np.argsort(distance)[1 : _NEIGHBOUR_PEAKS + 1]
+        first = -1
+        for a in range(_NEIGHBOUR_PEAKS):
+            for b in range(a + 1, _NEIGHBOUR_PEAKS):
+                p, q = at[near[a]] - at[i], at[near[b]] - at[i]
+                if hypot(p[0] + q[0], p[1] + q[1]) > _OPPOSITE * min(distance[near[a]], distance[near[b]]):
+                    continue
+                links[i, near[a]] = links[i, near[b]] = True
+                if first < 0:
+                    first = near[a]
+        second_direction = False
+        for j in near:
+            if links[i, j]:
+                p, q = at[j] - at[i], at[first] - at[i]
+                cross = abs(p[0] * q[1] - p[1] * q[0])
+                second_direction |= cross > _LEAST_SINE * distance[j] * distance[first]
+        if not second_direction:
+            links[i] = False
+    return links
+
+
+def _chess_response(image: np.ndarray) -> np.ndarray:
+    """(h - 10, w - 10) float32: ChESS response [grey levels] of the image (h, w), without a border of 5 px.
+
+    At an X-corner, opposite samples of the ring are equal, and samples a quarter turn apart differ. The mean of the
+    ring equals that of the centre. The response is the sum response minus the difference and mean responses.
+    """
+    grey = load_cv2().GaussianBlur(image, (0, 0), 1.0).astype(np.int16)
+    h, w = grey.shape
+
+    def moved(dx: int, dy: int) -> np.ndarray:
+        return grey[_RING_PX + dy : h - _RING_PX + dy, _RING_PX + dx : w - _RING_PX + dx]
+
+    pairs = [(moved(dx, dy), moved(-dx, -dy)) for dx, dy in _RING]
+    sums = [a + b for a, b in pairs]
+    crossed = sum(np.abs(sums[k] - sums[k + 4]).astype(np.int32) for k in range(4))
+    unlike = sum(np.abs(a - b).astype(np.int32) for a, b in pairs)
+    middle = sum(moved(dx, dy).astype(np.int32) for dx, dy in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1)))
+    off = np.abs(sum(s.astype(np.int32) for s in sums) - 16 * middle // 5)
+    return (crossed - unlike - off).astype(np.float32)
+
+
+def continues_beyond(image: np.ndarray, framed: np.ndarray) -> bool:
+    """Whether the pattern continues beyond a side of the board: X-corners are at more than half of the extrapolated
+    positions there. A search for a small board must not accept a part of a larger one.
+
+    framed (rows + 2, cols + 2, 2) px: the inner corners, and a row or column extrapolated beyond each side.
+    """
+    for turned in (framed, framed[::-1], framed.swapaxes(0, 1), framed.swapaxes(0, 1)[::-1]):
+        beside, inner = turned[0], turned[1, 1:-1]
+        along = 0.5 * (beside[2:] - beside[:-2])
+        if _crossings(image, beside[1:-1].copy(), along, inner - beside[1:-1]) > _CONTINUED_SHARE * len(inner):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _crossings(image, at, ea, eb):
+    """Number of X-corners near the points at (n, 2) px; ea and eb (n, 2) px: along their edges, one square long."""
+    count = 0
+    for i in range(len(at)):
+        most = _MOST_MOVE * min(hypot(ea[i, 0], ea[i, 1]), hypot(eb[i, 0], eb[i, 1])) + 1.0
+        has_saddle, u, v = find_saddle(image, at[i, 0], at[i, 1], ea[i], eb[i], _CLEAR, USUAL_BLUR_PX, most)
+        if has_saddle:
+            contrast = crossing_contrast(image, u, v, ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)
+            if max(contrast, crossing_contrast(image, u, v, -ea[i], eb[i], _CLEAR, USUAL_BLUR_PX)) >= LEAST_CONTRAST:
+                count += 1
+    return count

@@ -9,14 +9,13 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from icalib.detection.boards.aprilgrid import AprilGridDetector
+from icalib.detection.boards.aprilgrid import AprilGridDetector, MarkerDetector
 from icalib.detection.boards.charuco import CharucoDetector
 from icalib.detection.boards.checkerboard import CheckerboardDetector
 from icalib.detection.boards.circles import CirclesDetector
-from icalib.detection.boards.markers import MarkerDetector
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.detection.primitives.prediction import PredictedCorners, predict_corners
-from icalib.detection.primitives.quads import ImageWithQuads
+from icalib.detection.primitives.tags import ImageWithQuads
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 

@@ -1,8 +1,16 @@
-"""Kernels that find further tags of a grid at the positions predicted by tags already found."""
+"""Kernels that find further tags of a grid at the positions predicted by tags already found.
+
+Kernels that refine the corners of many tags at once, and measure the quality of each corner. Consistency checks:
+whether tags and corners lie where their neighbours predict them.
+"""
 
 from __future__ import annotations
 
+from math import exp, hypot
+from typing import Any
+
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from icalib.base.compiled import njit
 from icalib.detection.primitives.decoding import (
@@ -14,10 +22,24 @@ from icalib.detection.primitives.decoding import (
     unit_homography,
     visible_cells,
 )
-from icalib.detection.primitives.edge_model import LEAST_RISE, USUAL_BLUR_PX, solve_small
-from icalib.detection.primitives.edges import fit_quad
-from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
+from icalib.detection.primitives.edge_model import (
+    END_PX,
+    LEAST_RISE,
+    USUAL_BLUR_PX,
+    fit_corners,
+    fit_quad,
+    solve_small,
+    step_blur,
+)
+from icalib.detection.primitives.saddles import (
+    LEAST_WINDOW_PX,
+    MARGIN_BLURS,
+    crossing_contrast,
+    find_saddle,
+    fit_crossing,
+)
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
+from icalib.geometry.edge_fits import EDGE
 
 _NEIGHBOURS = 3  # tags that predict another, none farther than two rows or columns
 _LEAST_VISIBLE_CELLS = 12  # visible data cells of a tag that the image border cuts, at least
@@ -195,3 +217,293 @@ def grow(image, known, quads, board, cols, patterns, bits, border, clear, crossi
             n_corners, quad = _fitted(image, quad, clear, crossing)
             if n_corners >= 2 and _is_tag(image, quad, patterns[tag], bits, border):
                 known[tag], quads[tag], changed = True, quad, True
+
+
+# px, and of a side, the larger of both: largest distance of a corner from its rough position
+_MOST_CORNER_MOVE = (2.0, 0.03)
+_LEAST_STRIP_PX = 1.5  # least half width of the fitted strip along an edge
+_MOST_STRIP = (4.0, 3.0)  # px, and blurs: largest half width of the same strip
+_STRIP_BLURS = 2.25  # blurs between the strip along an edge and other features
+_BLUR_STRIP = (2.5, 0.06)  # px, and of a side: largest half width of the strip if only the blur is measured
+_LEAST_INSET_PX = (1.0, 0.5)  # as LEAST_WINDOW_PX, for features in the dark and in the white fields
+_END_BLURS = 2.4  # blurs left out at the ends of a side
+MEASURES = 5  # number of rows of `quality` before those of the edges
+
+
+@njit(cache=True, nogil=True)
+def _shape(quad, k):
+    """(sine of the angle at corner k, height [px] of the quad over its longer side there, shorter side [px])."""
+    ea, eb = side_vectors(quad, k)
+    la, lb = hypot(ea[0], ea[1]), hypot(eb[0], eb[1])
+    sine = abs(ea[0] * eb[1] - ea[1] * eb[0]) / max(la * lb, 1e-12)
+    return sine, min(la, lb) * sine, min(la, lb)
+
+
+@njit(cache=True, nogil=True)
+def _strip(least, blur, most):
+    """Half width [px] of the strip along an edge, if the nearest other feature is `least` px away."""
+    return min(max(least - _STRIP_BLURS * blur, _LEAST_STRIP_PX), most)
+
+
+@njit(cache=True, nogil=True)
+def _measured_blur(image, quad, k, least):
+    """Blur [px] across side k of the quad, or side k + 2 if k has no edge; NaN if neither has one."""
+    most = max(_BLUR_STRIP[0], _BLUR_STRIP[1] * shortest_side(quad))
+    for m in (k, k + 2):
+        u0, v0, u1, v1 = quad[m, 0], quad[m, 1], quad[(m + 1) % 4, 0], quad[(m + 1) % 4, 1]
+        blur, contrast = step_blur(image, u0, v0, u1, v1, END_PX, _strip(least, USUAL_BLUR_PX, most))
+        if contrast > 0.0:
+            return blur
+    return np.nan
+
+
+@njit(cache=True, nogil=True)
+def _measured_blurs(image, quads, least):
+    """(n, 2) blur [px] across each quad's sides 0 and 1; the median over the image if they have no edge."""
+    blur = np.empty((len(quads), 2))
+    for i in range(len(quads)):
+        for k in range(2):
+            blur[i, k] = _measured_blur(image, quads[i], k, least[i])
+    known = blur.ravel()[~np.isnan(blur.ravel())]
+    usual = np.median(known) if len(known) else USUAL_BLUR_PX
+    for i in range(len(quads)):
+        for k in range(2):
+            if np.isnan(blur[i, k]):
+                blur[i, k] = usual
+    return blur
+
+
+@njit(cache=True, nogil=True)
+def _shapes(quads, quality):
+    """Fills the rows sine, height and side of `quality`; returns (n,) the least height [px] of each quad."""
+    least = np.empty(len(quads))
+    for i in range(len(quads)):
+        for k in range(4):
+            quality[2, i, k], quality[3, i, k], quality[4, i, k] = _shape(quads[i], k)
+        least[i] = quality[3, i].min()
+    return least
+
+
+@njit(cache=True, nogil=True)
+def refined_crossings(image, quads, surroundings):
+    """(uv (n, 4, 2) px, quality (5 + 2 EDGE, n, 4)) of the X-corners at the quads (n, 4, 2) px.
+
+    surroundings: as in `fit_crossing`. Rows of quality: sigma [px] per axis for image noise of one grey level, NaN if
+    there is no corner; blur [px]; sine of the angle between the edges; distance to the nearest other feature minus the
+    distance that the smallest window needs [px]; shorter side [px]; both edges of the corner, as in `edge_fits`.
+    """
+    uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
+    blur = _measured_blurs(image, quads, surroundings.min() * _shapes(quads, quality))
+    for i in range(len(quads)):
+        quality[1, i] = blur[i].max()
+        for k in range(4):
+            ea, eb = side_vectors(quads[i], k)
+            most_move = max(_MOST_CORNER_MOVE[0], _MOST_CORNER_MOVE[1] * quality[4, i, k])
+            blur_a, blur_b = blur[i, k % 2], blur[i, (k + 1) % 2]
+            u, v, sigma, contrast, edges = fit_crossing(
+                image, quads[i, k, 0], quads[i, k, 1], ea, eb, surroundings, blur_a, blur_b, most_move
+            )
+            uv[i, k, 0], uv[i, k, 1] = u, v
+            quality[0, i, k] = sigma if contrast >= LEAST_CONTRAST else np.nan
+            quality[MEASURES:, i, k] = edges.ravel()
+    room = surroundings[0] * quality[3] - LEAST_WINDOW_PX
+    for k in range(2):
+        room = np.minimum(room, surroundings[1 + k] * quality[3] - _LEAST_INSET_PX[k])
+    quality[3] = room - MARGIN_BLURS * quality[1]
+    return uv, quality
+
+
+@njit(cache=True, nogil=True)
+def refined_corners(image, quads, clear):
+    """As `refined_crossings`, for the L-corners of dark quads with clockwise corners in the image.
+
+    clear: distance of the nearest other feature, in units of the quad's sides.
+    """
+    uv, quality = np.empty(quads.shape), np.empty((MEASURES + 2 * EDGE, len(quads), 4))
+    least = clear * _shapes(quads, quality)
+    for i in range(len(quads)):
+        most = max(_MOST_STRIP[0], _BLUR_STRIP[1] * shortest_side(quads[i]))
+        first, _, blur, _ = fit_corners(image, quads[i], END_PX, _strip(least[i], USUAL_BLUR_PX, most))
+        half = _strip(least[i], blur.max(), max(_MOST_STRIP[0], _MOST_STRIP[1] * blur.max()))
+        end = max(END_PX, _END_BLURS * blur.max())
+        uv[i], quality[0, i], quality[1, i], edges = fit_corners(image, first, end, half)
+        for k in range(4):
+            quality[MEASURES:, i, k] = edges[k].ravel()
+            most_move = max(_MOST_CORNER_MOVE[0], _MOST_CORNER_MOVE[1] * quality[4, i, k])
+            if hypot(uv[i, k, 0] - quads[i, k, 0], uv[i, k, 1] - quads[i, k, 1]) > most_move:
+                quality[0, i, k] = np.nan
+    quality[3] = clear * quality[3] - _LEAST_STRIP_PX - _STRIP_BLURS * quality[1]
+    return uv, quality
+
+
+_PLACING_CORNERS = 12
+# px, and of a side, added: largest distance of a corner from its prediction by neighbours
+_MOST_CORNER_OFF = (1.0, 0.05)
+_OFF = (0.3, 0.01, 6.0)  # px and of a side, added, or times the median distance: the same, if most corners agree better
+_STRAIGHT_FOCAL = 1e4  # image widths: focal length of a lens without distortion
+_BENT = (0.1, 2.0)  # image widths: range of focal lengths of lenses with distortion
+_SAME_LOG = 0.02  # tolerance of the logarithm of the focal length
+# share of the median distance without distortion that the model of distortion may leave at single corners
+_UNSURE = 0.2
+_MOST_ANGLE = 3.0  # rad: largest angle from the axis of a lens
+_FAR_PX = 1e9
+_LEAST_DEPTH = 0.1  # cosine of the angle between a corner's ray and a neighbour's
+_GROWTH_BESIDE = 1.5  # growth of errors with the squared distance from the mean of the neighbours, over their variance
+_LINK_OFF = 0.3  # tag sides of error per tag of distance at which a tag still predicts the centre of another
+
+
+def largest_group(known: np.ndarray, quads: np.ndarray, board: np.ndarray) -> np.ndarray:
+    """(n,) bool: the largest group of known tags that are connected by links.
+
+    Two tags are linked if each predicts the other's centre. known (n,) bool; quads (n, 4, 2) px; board (n, 4, 2) in tag
+    sizes.
+    """
+    tags = np.flatnonzero(known)
+    links = _links(quads[tags], board[tags])
+    groups: list[np.ndarray] = []
+    left = np.ones(len(tags), dtype=bool)
+    while left.any():
+        group = np.zeros(len(tags), dtype=bool)
+        group[np.argmax(left)] = True
+        while (reached := links[group].any(axis=0) | group).sum() > group.sum():
+            group = reached
+        groups.append(group)
+        left &= ~group
+    out = np.zeros(len(known), dtype=bool)
+    if groups:
+        out[tags[max(groups, key=lambda group: int(group.sum()))]] = True
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _links(quads, board):
+    """(m, m) bool: which tags predict each other's centre. quads (m, 4, 2) px, board (m, 4, 2) in tag sizes."""
+    m = len(quads)
+    predicts = np.zeros((m, m), dtype=np.bool_)
+    for i in range(m):
+        H = unit_homography(quads[i])
+        ax, ay = board[i, 1, 0] - board[i, 0, 0], board[i, 1, 1] - board[i, 0, 1]
+        bx, by = board[i, 3, 0] - board[i, 0, 0], board[i, 3, 1] - board[i, 0, 1]
+        for j in range(m):
+            x, y = board[j, :, 0].mean() - board[i, 0, 0], board[j, :, 1].mean() - board[i, 0, 1]
+            s, t = x * ax + y * ay, x * bx + y * by
+            u, v = mapped(H, s, t)
+            side = hypot(quads[j, 1, 0] - quads[j, 0, 0], quads[j, 1, 1] - quads[j, 0, 1])
+            side = max(side, hypot(quads[j, 3, 0] - quads[j, 0, 0], quads[j, 3, 1] - quads[j, 0, 1]))
+            off = hypot(quads[j, :, 0].mean() - u, quads[j, :, 1].mean() - v)
+            predicts[i, j] = off < _LINK_OFF * side * max(hypot(s - 0.5, t - 0.5), 1.0)
+    return predicts & predicts.T
+
+
+def consistent_corners(
+    uv: np.ndarray, board: np.ndarray, valid: np.ndarray, side: np.ndarray, shape: tuple[int, ...]
+) -> np.ndarray:
+    """(N,) bool: whether each corner lies where a homography of its 12 nearest neighbours predicts it. True for those
+    that are not valid.
+
+    The bound is 6 times the median distance, at least 0.3 px + 0.01 sides and at most 1 px + 0.05 sides. The worst
+    corner is left out first, and the others are tested again. If some corners fail, a lens with distortion is tried,
+    and used if the median distance is smaller. The bound is then at least a fifth of the median distance without
+    distortion.
+
+    uv (N, 2) px, board (N, 2), valid (N,) bool: corners that were measured; side (N,) px; shape (h, w) of the image,
+    whose centre is taken for the principal point.
+    """
+    middle, width = 0.5 * np.array(shape[1::-1]), float(shape[1])
+    straight = _agreeing(_rays(uv - middle, _STRAIGHT_FOCAL * width, False), board, valid, side)
+    if straight.all():
+        return straight
+    bent = _bent_rays(uv - middle, width, board, valid)
+    usual = [_usual(rays, board, valid) for rays in (_rays(uv - middle, _STRAIGHT_FOCAL * width, False), bent)]
+    return _agreeing(bent, board, valid, side, _UNSURE * usual[0]) if usual[1] < usual[0] else straight
+
+
+Rays = tuple[np.ndarray, np.ndarray]  # (N, 3) unit rays, (N,) px per radian
+
+
+def _bent_rays(uv: np.ndarray, width: float, board: np.ndarray, valid: np.ndarray) -> Rays:
+    """Rays through the lens with distortion at which the corners agree best with their predictions by neighbours. Two
+    lens models and any focal length are tried. uv (N, 2) px from the image centre."""
+    best: tuple[float, Rays] | None = None
+    for equidistant in (False, True):
+
+        def usual(log_focal: float, equidistant: bool = equidistant) -> float:
+            return _usual(_rays(uv, width * exp(log_focal), equidistant), board, valid)
+
+        done: Any = minimize_scalar(usual, bounds=np.log(_BENT), method="bounded", options={"xatol": _SAME_LOG})
+        if best is None or done.fun < best[0]:
+            best = done.fun, _rays(uv, width * exp(done.x), equidistant)
+    assert best is not None
+    return best[1]
+
+
+def _usual(rays: Rays, board: np.ndarray, valid: np.ndarray) -> float:
+    """Median distance [px] of valid corners from their predictions; 1e9 if there are too few."""
+    off = distance_from_neighbours(*rays, board, valid, _PLACING_CORNERS)
+    placed = valid & np.isfinite(off)
+    return float(np.median(off[placed])) if placed.any() else _FAR_PX
+
+
+def _agreeing(rays: Rays, board: np.ndarray, valid: np.ndarray, side: np.ndarray, unsure: float = 0.0) -> np.ndarray:
+    """As `consistent_corners`, for one lens. unsure [px]: least bound, for the remaining error of the lens model."""
+    used, most = valid.copy(), _MOST_CORNER_OFF[0] + _MOST_CORNER_OFF[1] * side
+    while True:
+        off = distance_from_neighbours(*rays, board, used, _PLACING_CORNERS)
+        placed = used & np.isfinite(off)
+        usual = float(np.median(off[placed])) if placed.any() else np.inf
+        bound = np.minimum(most, np.maximum(_OFF[0] + _OFF[1] * side, max(_OFF[2] * usual, unsure)))
+        excess = np.where(placed, off / bound, 0.0)
+        if not len(excess) or excess.max() <= 1.0:
+            return used | ~valid
+        used[np.argmax(excess)] = False
+
+
+def _rays(uv: np.ndarray, focal: float, equidistant: bool) -> Rays:
+    """Rays of pixels uv (N, 2) from the principal point, for focal length `focal` [px]. The lens is stereographic,
+    which is the division model of distortion (Fitzgibbon 2001), or equidistant, as most fisheyes nearly are."""
+    radius = np.hypot(uv[:, 0], uv[:, 1])
+    r = radius / focal
+    angle = np.minimum(r, _MOST_ANGLE) if equidistant else 2.0 * np.arctan(0.5 * r)
+    across = np.sin(angle) / np.maximum(radius, 1e-12)
+    rays = np.column_stack([across[:, None] * uv, np.cos(angle)])
+    return rays, np.full(len(uv), focal) if equidistant else focal * (1.0 + 0.25 * r * r)
+
+
+@njit(cache=True, nogil=True)
+def distance_from_neighbours(rays, scale, xy, used, n_near):
+    """(n,) px: distance of each corner from its prediction by the nearest corners on the board xy (n, 2); inf if fewer
+    than 6 can be used.
+
+    rays (n, 3): of the corners, in the camera; scale (n,): px per radian; used (n,) bool: corners that predict. The
+    n_near nearest of them are projected by a pinhole camera that looks at the corner, and a homography predicts it. If
+    the corner is beside its neighbours rather than among them, the distance is divided by the growth of errors there.
+    """
+    out, near = np.full(len(rays), np.inf), np.empty(len(rays))
+    px, pu = np.empty((n_near, 2)), np.empty((n_near, 2))
+    for i in range(len(rays)):
+        for j in range(len(rays)):
+            near[j] = hypot(xy[j, 0] - xy[i, 0], xy[j, 1] - xy[i, 1]) if used[j] and j != i else np.inf
+        order, n = np.argsort(near), 0
+        a, b = _across(rays[i])
+        for j in order[:n_near]:
+            depth = (rays[i] * rays[j]).sum()
+            if np.isfinite(near[j]) and depth > _LEAST_DEPTH:
+                px[n] = xy[j]
+                pu[n, 0], pu[n, 1] = scale[i] * (a * rays[j]).sum() / depth, scale[i] * (b * rays[j]).sum() / depth
+                n += 1
+        if n >= 6:
+            u, v = mapped(fit_homography(px, pu, n), xy[i, 0], xy[i, 1])
+            x, y = px[:n, 0].mean(), px[:n, 1].mean()
+            spread = ((px[:n, 0] - x) ** 2 + (px[:n, 1] - y) ** 2).mean()
+            beside = ((xy[i, 0] - x) ** 2 + (xy[i, 1] - y) ** 2) / max(spread, 1e-12)
+            out[i] = hypot(u, v) / (1.0 + _GROWTH_BESIDE * beside)
+    return out
+
+
+@njit(cache=True, nogil=True)
+def _across(ray):
+    """Two unit vectors (3,) orthogonal to a unit ray and to each other."""
+    a = np.array([ray[2], 0.0, -ray[0]]) if abs(ray[1]) > 0.5 else np.array([0.0, ray[2], -ray[1]])
+    a /= np.sqrt((a * a).sum())
+    b = np.array([ray[1] * a[2] - ray[2] * a[1], ray[2] * a[0] - ray[0] * a[2], ray[0] * a[1] - ray[1] * a[0]])
+    return a, b

@@ -7,12 +7,10 @@ from math import hypot
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.detection.primitives.consistency import consistent_corners
 from icalib.detection.primitives.corners import ImageCorners, no_corners, with_verdicts
 from icalib.detection.primitives.edge_model import USUAL_BLUR_PX
-from icalib.detection.primitives.growth import LEAST_SIDE_PX, side_vectors
+from icalib.detection.primitives.growth import LEAST_SIDE_PX, consistent_corners, refined_crossings, side_vectors
 from icalib.detection.primitives.prediction import predict_nodes
-from icalib.detection.primitives.refinement import refined_crossings
 from icalib.detection.primitives.saddles import crossing_contrast, find_saddle
 from icalib.detection.primitives.tags import LEAST_CONTRAST, shortest_side
 

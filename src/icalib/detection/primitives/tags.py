@@ -1,17 +1,31 @@
-"""Tags of one family in an image: dark quads whose cells are a pattern of the family."""
+"""Tags of one family in an image: dark quads whose cells are a pattern of the family.
+
+Dark quads in an image, which are candidates for tags. Families of tags: the bit patterns of all ids, packed for a fast
+lookup.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import lru_cache
+from math import comb
 
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.detection.primitives.decoding import cell_greys, dark_in_ring, levels, lookup, read_cells, unit_homography
-from icalib.detection.primitives.edge_model import LEAST_RISE
-from icalib.detection.primitives.edges import fit_quad
-from icalib.detection.primitives.families import Family
-from icalib.detection.primitives.quads import ImageWithQuads
+from icalib.base.extras import load_cv2
+from icalib.detection.primitives.corners import checked_image
+from icalib.detection.primitives.decoding import (
+    cell_greys,
+    dark_in_ring,
+    least_distance,
+    levels,
+    lookup,
+    read_cells,
+    unit_homography,
+)
+from icalib.detection.primitives.edge_model import LEAST_RISE, fit_quad
+from icalib.geometry.targets.families import family_name, is_apriltag, opencv_bits
 
 LEAST_CONTRAST = 16.0  # grey levels between black and white of a tag
 _WRONG_BORDER = 0.15  # share of the cells of the black border that may be white
@@ -106,3 +120,138 @@ def decode(image, quad, bits, border, codes, max_errors):
     if errors > max_errors:
         return -1, 0, contrast
     return tag, turn, contrast
+
+
+_QUAD_CONTRAST = 7  # grey levels below the local mean at which a pixel is dark
+_LEAST_SIDE_PX = 7.0  # longer side of the bounding box, at least
+_LEAST_FILL = 0.75  # share of its quad's area that a contour covers, at least
+_STRAIGHT_SIDE = 0.05  # of the perimeter: largest distance of a contour from its polygon
+_WINDOW_SHARES = (0.08, 0.03, 0.2)  # widths of the windows of the local mean, as shares of the image's width
+
+
+@dataclass(frozen=True, eq=False)
+class ImageWithQuads:
+    """An image (h, w) uint8 with a cache of its dark quads, which several detectors share.
+
+    Raises RecordingError for an image that is not grey with 8 bits.
+    """
+
+    image: np.ndarray
+    _quads: dict[tuple[int, bool], np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "image", checked_image(self.image))
+
+    @property
+    def windows(self) -> tuple[int, ...]:
+        """Windows [px] of `threshold_windows` for this image."""
+        return threshold_windows(self.image.shape[1])
+
+    def quads(self, window: int, separate: bool) -> np.ndarray:
+        """`dark_quads` of the image, from the cache if known."""
+        if (window, separate) not in self._quads:
+            self._quads[window, separate] = dark_quads(self.image, window, separate)
+        return self._quads[window, separate]
+
+
+def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
+    """(n, 4, 2) px: clockwise corners of dark regions with about four straight sides, accurate to about 2 px.
+
+    image (h, w) uint8. Pixels are dark if they are darker than the mean of `window` x `window` px (odd). With
+    `separate`, dark regions are first eroded by one pixel, so that tags whose corners touch other dark squares are
+    separated.
+    """
+    cv2 = load_cv2()
+    dark = cv2.adaptiveThreshold(
+        image, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY_INV, window, float(_QUAD_CONTRAST)
+    )
+    if separate:
+        dark = cv2.erode(dark, np.ones((3, 3), dtype=np.uint8))
+    contours, hierarchy = cv2.findContours(dark, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    if hierarchy is None:
+        return np.zeros((0, 4, 2))
+    quads = []
+    for contour, parent in zip(contours, hierarchy[0, :, 3], strict=True):
+        if parent < 0 and len(contour) >= 4:
+            quad = _quad(cv2, contour)
+            if quad is not None:
+                quads.append(_grown(quad) if separate else quad)
+    return np.array(quads).reshape(-1, 4, 2)
+
+
+def _quad(cv2, contour: np.ndarray) -> np.ndarray | None:
+    """The quad (4, 2) of a contour, clockwise; None if it is too small, has not four corners, or fills too little of
+    its quad."""
+    _, _, width, height = cv2.boundingRect(contour)
+    if max(width, height) < _LEAST_SIDE_PX or min(width, height) < 0.25 * _LEAST_SIDE_PX:
+        return None
+    hull = cv2.convexHull(contour)
+    corners = cv2.approxPolyDP(hull, _STRAIGHT_SIDE * cv2.arcLength(hull, True), True)
+    if len(corners) != 4:
+        return None
+    quad = corners[:, 0, :].astype(np.float64)
+    area = cv2.contourArea(corners, True)
+    if cv2.contourArea(contour) < _LEAST_FILL * abs(area):
+        return None
+    return quad if area > 0 else quad[::-1]
+
+
+def _grown(quad: np.ndarray) -> np.ndarray:
+    """The quad with each corner moved outwards by one diagonal pixel."""
+    out = quad - quad.mean(axis=0)
+    return quad + np.sqrt(2.0) * out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
+def threshold_windows(width: int) -> tuple[int, ...]:
+    """Windows [px] of `dark_quads` for images of this width, in the order in which they are tried."""
+    return tuple(max(2 * int(0.5 * share * width) + 1, 11) for share in _WINDOW_SHARES)
+
+
+_FALSE_ALARMS = 1e-3  # largest share of random patterns that may be accepted as tags
+
+
+@dataclass(frozen=True)
+class Family:
+    """One family of tags with `bits` x `bits` data cells. codes (n, 4) uint64: the pattern of id i, rotated by 0 to 3
+    quarter turns.
+
+    Patterns are OpenCV's, packed row by row from the top left cell, the first cell in the highest bit, white as 1.
+    max_errors: wrong cells with which a pattern is still accepted.
+    """
+
+    name: str
+    bits: int
+    codes: np.ndarray
+    max_errors: int
+
+    @property
+    def is_apriltag(self) -> bool:
+        """Whether this is a family of AprilTags, not of ArUco markers."""
+        return is_apriltag(self.name)
+
+
+@lru_cache(maxsize=32)
+def tag_family(name: str) -> Family:
+    """The family of this name. Raises RigError if there is none, see `family_name`."""
+    name = family_name(name)
+    patterns = opencv_bits(name)
+    n, bits, _ = patterns.shape
+    codes = np.array([[_packed(np.rot90(pattern, turn)) for turn in range(4)] for pattern in patterns])
+    correctable = (int(least_distance(codes)) - 1) // 2
+    return Family(name, bits, codes, min(correctable, _errors_allowed(4 * n, bits * bits)))
+
+
+def _errors_allowed(n_codes: int, n_cells: int) -> int:
+    """Largest number of wrong cells at which at most `_FALSE_ALARMS` of all random patterns are accepted."""
+    errors, accepted = 0, n_codes
+    while (accepted := accepted + n_codes * comb(n_cells, errors + 1)) <= _FALSE_ALARMS * 2.0**n_cells:
+        errors += 1
+    return errors
+
+
+def _packed(pattern: np.ndarray) -> np.uint64:
+    """The cells of a pattern as uint64, the first cell in the highest bit."""
+    value = 0
+    for cell in pattern.ravel():
+        value = 2 * value + int(cell)
+    return np.uint64(value)

@@ -8,8 +8,7 @@ from icalib.geometry.cameras.double_sphere import DoubleSphere
 from icalib.geometry.cameras.equidistant import PinholeEquidistant
 from icalib.geometry.cameras.eucm import ExtendedUnified
 from icalib.geometry.cameras.omni import OmniRadtan
-from icalib.geometry.cameras.radtan import PinholeRadtan
-from icalib.geometry.cameras.radtan5 import PinholeRadtan5
+from icalib.geometry.cameras.radtan import PinholeRadtan, PinholeRadtan5
 from icalib.geometry.cameras.rational import PinholeRational
 
 CAMERA_MODELS: dict[str, CameraModel] = {

@@ -1,4 +1,7 @@
-"""Pinhole cameras with radial-tangential distortion, as in OpenCV and Kalibr ("radtan", Brown-Conrady)."""
+"""Pinhole cameras with radial-tangential distortion, as in OpenCV and Kalibr ("radtan", Brown-Conrady).
+
+Pinhole camera with radial-tangential distortion of five coefficients, ROS's "plumb_bob" and OpenCV's default.
+"""
 
 from __future__ import annotations
 
@@ -158,3 +161,15 @@ def _unproject(params, coefficients, uv, limit, rays, valid):
             a, b = 0.0, 0.0
         norm = np.sqrt(1.0 + a * a + b * b)
         rays[i, 0], rays[i, 1], rays[i, 2] = a / norm, b / norm, 1.0 / norm
+
+
+class PinholeRadtan5(RadialTangential):
+    """Radial-tangential distortion with a third radial coefficient, for lenses that two do not describe in the image
+    corners.
+
+    k3 is the last parameter, as in OpenCV's distCoeffs and ROS's CameraInfo.D.
+    """
+
+    name = "pinhole-radtan5"
+    parameter_names = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+    start_distortions = ((0.0, 0.0, 0.0, 0.0, 0.0),)

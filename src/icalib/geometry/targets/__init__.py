@@ -9,10 +9,8 @@ from icalib.geometry.targets.base import Target
 from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
 from icalib.geometry.targets.circles import Circles
-from icalib.geometry.targets.markers import Markers
-from icalib.geometry.targets.nothing import NoTarget
-from icalib.geometry.targets.scene import Scene
-from icalib.geometry.targets.tag import Tag
+from icalib.geometry.targets.markers import Markers, Tag
+from icalib.geometry.targets.scene import NoTarget, Scene
 
 __all__ = [
     "TARGETS",

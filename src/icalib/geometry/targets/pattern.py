@@ -13,7 +13,7 @@ from icalib.geometry.targets.charuco import Charuco
 from icalib.geometry.targets.checkerboard import Checkerboard
 from icalib.geometry.targets.circles import Circles
 from icalib.geometry.targets.families import opencv_bits, tag_bits
-from icalib.geometry.targets.tag import Tag
+from icalib.geometry.targets.markers import Tag
 
 _SAME_M = 1e-9  # edges at most this far apart are merged
 _Box = tuple[float, float, float, float, bool]  # left, bottom, right, top [m]; white

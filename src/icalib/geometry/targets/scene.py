@@ -1,11 +1,14 @@
-"""Several targets in one scene."""
+"""Several targets in one scene.
+
+No target: cameras use feature tracks of the scene.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 
@@ -133,3 +136,27 @@ def _rows_of(target: Target, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarr
     identities = np.stack(target.point_identity(np.arange(len(target.points))), axis=1)
     base = 1 + int(max(identities.max(), tag_id.max(initial=0), corner.max(initial=0)))
     return np.isin(tag_id * base + corner, identities[:, 0] * base + identities[:, 1]) & (tag_id >= 0) & (corner >= 0)
+
+
+@final
+@dataclass(frozen=True)
+class NoTarget(Target):
+    """A target without points, for rigs without a target."""
+
+    type: ClassVar[str] = "none"
+    blooms: ClassVar[bool] = False
+
+    @cached_property
+    def points(self) -> np.ndarray:
+        return np.zeros((0, 3))
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        return ()
+
+    def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
+        del tag_id, corner
+        raise RecordingError("the rig file has no target; add one.")
+
+    def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return index, index

@@ -2,13 +2,24 @@
 
 The facet `initialize` of a kind holds an `Initializer` as `INITIALIZER`. A kind overrides what it supports. The
 defaults are those of a sensor that does not show the motion and needs no guess.
+
+Largest spacing of keyframes if smooth motion is assumed in place of an IMU.
+
+Between keyframes the motion is propagated with constant angular rate and acceleration. White angular acceleration of
+density `turning` [rad/s^2/sqrt(Hz)] adds a rotation of turning sqrt(t^3 / 3) in t seconds. White jerk of density
+`jerking` [m/s^3/sqrt(Hz)] adds a displacement of jerking sqrt(t^5 / 20) (integrated Wiener processes). Both must stay
+below MAX_PROPAGATION_SHARE of the measurement noise. Poses are at most half a spacing from their keyframe. Increments
+span a whole spacing h, and their noise grows with sqrt(h).
+
+The upward direction: by gravity, or by a level frame of a sensor if gravity is not observed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import sqrt
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -17,8 +28,7 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets import NoTarget
-from icalib.initialize.steps.keyframe_spacing import SmoothMotion
-from icalib.initialize.steps.smooth_trajectory import BodyPoses
+from icalib.initialize.steps.smooth_trajectory import BodyPoses, SmoothTrajectory
 from icalib.optim.state import Key, State
 from icalib.rig import Rig, Sensor
 from icalib.sensors import SENSOR_KINDS, facet
@@ -222,3 +232,73 @@ def inputs_of_sensors(inputs: Inputs, recordings: Sequence[Measurements], names:
     if not any(s.sees_target for s in chosen.mounted):
         chosen = chosen.only(*chosen.sensors, target=NoTarget())
     return inputs_for(chosen, [m.only(*chosen.sensors) for m in recordings], inputs)
+
+
+MAX_PROPAGATION_SHARE = 0.25  # propagation error over measurement noise: it adds 6 % to the variance
+
+
+@dataclass(frozen=True)
+class SmoothMotion:
+    """The assumed motion: densities `turning` [rad/s^2/sqrt(Hz)] and `jerking` [m/s^3/sqrt(Hz)] of the body, and its
+    trajectory in each recording."""
+
+    paths: Sequence[SmoothTrajectory]
+    turning: float
+    jerking: float
+
+    def spacing_for_poses(self, rotation_noise: float, position_noise: float) -> float:
+        """The largest spacing [s] for poses with noise of these standard deviations [rad, m]."""
+        return min(
+            2.0 * (3.0 * (MAX_PROPAGATION_SHARE * rotation_noise / self.turning) ** 2) ** (1 / 3),
+            2.0 * (20.0 * (MAX_PROPAGATION_SHARE * position_noise / self.jerking) ** 2) ** 0.2,
+        )
+
+    def spacing_for_increments(self, rotation_noise: float, position_noise: float) -> float:
+        """The largest spacing [s] for increments with noise of these densities [rad/sqrt(s), m/sqrt(s)]."""
+        return min(
+            sqrt(3.0) * MAX_PROPAGATION_SHARE * rotation_noise / self.turning,
+            (20.0 * (MAX_PROPAGATION_SHARE * position_noise / self.jerking) ** 2) ** 0.25,
+        )
+
+
+# Cosine between the vehicle's axis of rotation and z of a frame: a frame more than 45 degrees off is not level
+MIN_LEVEL_COSINE = 0.7
+
+
+@dataclass(frozen=True)
+class Verticals:
+    """candidates: upward unit vectors (3,) in IMU axes, the more likely one first; level_sensor: the sensor whose level
+    frame decides between both directions, or None."""
+
+    candidates: tuple[np.ndarray, ...]
+    level_sensor: str | None = None
+
+
+def possible_verticals(inputs: Inputs, state: State) -> Verticals:
+    """Upward directions by gravity. Without an IMU, the main axis of rotation of the vehicle, whose sign follows from
+    the level frame of a sensor. Without such a frame both signs are possible: a vehicle whose left and right are
+    swapped drives upside down."""
+    if not inputs.rig.assumes_motion:
+        return Verticals((np.einsum("nji,j->i", state.rotation, [0.0, 0.0, 1.0]),))
+    assert inputs.imu is not None
+    axis = np.linalg.svd(inputs.imu.gyro.T @ inputs.imu.gyro)[0][:, 0]
+    along, level = _vertical_by_frames(inputs, state, axis)
+    return Verticals((np.sign(along) * axis,), level) if level else Verticals((axis, -axis))
+
+
+def level_sensor(inputs: Inputs, state: State) -> str | None:
+    """The sensor whose level frame shows the upward direction, for a rig without an IMU. None if there is no such
+    sensor."""
+    turns = state.bias[:, :3]  # of an assumed motion: minus the angular rate
+    return _vertical_by_frames(inputs, state, np.linalg.svd(turns.T @ turns)[0][:, 0])[1]
+
+
+def _vertical_by_frames(inputs: Inputs, state: State, axis: np.ndarray) -> tuple[float, str | None]:
+    """The upward component of the main axis of rotation `axis` (3,) in the IMU's axes, and the sensor whose frame shows
+    it."""
+    in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
+    for sensor in inputs.rig.mounted:
+        up = initializer_of(sensor).vertical(state, sensor)
+        if up is not None and abs(along := float(in_world @ up)) > MIN_LEVEL_COSINE:
+            return along, sensor.name
+    return 0.0, None

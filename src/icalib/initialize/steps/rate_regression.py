@@ -4,6 +4,8 @@
 
 M (3, 3) is free, so neither the rotation between both sensors nor the scale of the rates must be known; b absorbs the
 gyroscope's bias. The offset is the shift with the largest logarithm of the likelihood ratio, -n/2 log(1 - R^2).
+
+Mean angular rate of an IMU over the intervals between images or poses.
 """
 
 from __future__ import annotations
@@ -13,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
+from icalib.geometry.integrals import once_integrated
 from icalib.geometry.vectors import MEDIAN_NORM
-from icalib.initialize.steps.gyro_rates import MeanRates
 from icalib.initialize.steps.rate_correlation import (
     MAX_OFFSET_PEAKS,
     MIN_PEAK_DISTANCE_S,
     MIN_RATE_OVERLAP_S,
     SensorRates,
+    interpolated,
 )
 from icalib.motion.imu_data import ImuData, clear_of
 
@@ -135,3 +138,26 @@ def _explained_share(
     slope = np.linalg.solve(auto_covariance + least[:, None, None] * np.eye(3), cross_covariance.transpose(0, 2, 1))
     spread = spread + REGULARISING_SPREAD * count * float((a**2).sum(axis=1).mean()) + 1e-12
     return np.clip(np.einsum("nij,nji->n", cross_covariance, slope) / spread, 0.0, 1.0), count
+
+
+@dataclass(frozen=True)
+class MeanRates:
+    """Means of the gyroscope's readings. angle (N, 3) rad: their integral from the first stamp to each."""
+
+    imu: ImuData
+    angle: np.ndarray
+
+    @classmethod
+    def of(cls, imu: ImuData) -> MeanRates:
+        """Integrates the readings of `imu` by the trapezoidal rule."""
+        return cls(imu, once_integrated(imu.gyro, np.diff(imu.seconds)))
+
+    def over(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Mean rates (n, 3) rad/s over intervals from start to end (n,), in s on the IMU's clock."""
+        t = self.imu.seconds
+        return (interpolated(t, self.angle, end) - interpolated(t, self.angle, start)) / (end - start)[:, None]
+
+    def slope(self, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+        """Derivatives (n, 3) rad/s^2 of the mean rates by a common shift of start and end."""
+        t, gyro = self.imu.seconds, self.imu.gyro
+        return (interpolated(t, gyro, end) - interpolated(t, gyro, start)) / (end - start)[:, None]

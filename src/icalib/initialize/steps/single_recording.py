@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.recordings.several import naming
+from icalib.data.recordings.opening import naming
 from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.motion.imu_data import imu_data
 from icalib.optim.state import Key, State

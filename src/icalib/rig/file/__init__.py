@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import yaml
 
-from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.files import NAME, NAME_WORDS
 from icalib.base.yaml_nodes import YamlValue, parse_yaml, read_yaml
 from icalib.geometry.targets import NoTarget, Scene, Target
 from icalib.rig.complete import lack_of

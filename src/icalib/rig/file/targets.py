@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.files import NAME, NAME_WORDS
 from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target

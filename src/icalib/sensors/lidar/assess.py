@@ -22,7 +22,7 @@ from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.binning import LidarNoise, in_world
-from icalib.sensors.lidar.initialize.degeneracy import count_directions, normal_shares
+from icalib.sensors.lidar.initialize.voxel_map import count_directions, normal_shares
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 

@@ -14,7 +14,7 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
 from icalib.sensors.lidar.spec import Lidar
-from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.scenario.fields import at_least, interval, mounted_fields
 from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
 from icalib.tools.simulation.scenario.robot import Drive

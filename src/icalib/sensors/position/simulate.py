@@ -12,8 +12,7 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue
 from icalib.sensors.position.spec import LEVELLED, TILTED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
-from icalib.tools.simulation.output.bag_writer import BagWriter
-from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.output import BagWriter, write_table
 from icalib.tools.simulation.scenario.fields import at_least, mounted_fields, pose
 from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
 from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.vectors import is_near
-from icalib.initialize.steps.vertical import level_sensor
+from icalib.initialize.steps.initializer import level_sensor
 from icalib.motion.factor import of_type, pairs_of
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
 from icalib.result.excess import excess, times

@@ -14,8 +14,7 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import RigError
 from icalib.sensors.wheels.spec import WheelKind, Wheels, drive_names
-from icalib.tools.simulation.output.bag_writer import BagWriter
-from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.output import BagWriter, write_table
 from icalib.tools.simulation.scenario.fields import at_least, mounted_fields
 from icalib.tools.simulation.scenario.instants import LEAD_S, check_enough, stamped
 from icalib.tools.simulation.scenario.robot import Drive

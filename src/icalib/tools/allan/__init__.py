@@ -1,7 +1,13 @@
 """Noise densities, bias walks and bias instabilities of an IMU, from a recording at rest."""
 
-from icalib.tools.allan.analysis import ImuNoiseStudy, SensorNoise, study_imu, study_recording
-from icalib.tools.allan.deviation import Deviation, allan_deviation
+from icalib.tools.allan.analysis import (
+    Deviation,
+    ImuNoiseStudy,
+    SensorNoise,
+    allan_deviation,
+    study_imu,
+    study_recording,
+)
 from icalib.tools.allan.files import write_study
 from icalib.tools.allan.fit import AllanFit
 

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from icalib.data.measurements import Measurements
-from icalib.data.recordings.several import Source
+from icalib.data.recordings.opening import Source
 from icalib.errors import CalibrationError, EstimationError
 from icalib.geometry import so3
 from icalib.pipeline import Progress, calibrate_measurements, measure

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-from icalib.base.text_files import json_text, printable
+from icalib.base.files import json_text, printable
 from icalib.result import SensorFit
 from icalib.result.quantities import chi2_words, rms_words
 from icalib.tools.check.check import Check

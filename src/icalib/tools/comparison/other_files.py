@@ -10,7 +10,7 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue, read_yaml
 from icalib.errors import CalibrationError
 from icalib.export.kalibr import KALIBR_NOISE
-from icalib.export.urdf_tree import read_urdf
+from icalib.export.urdf import read_urdf
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.tools.comparison.results import DENSITIES, noise_quantities, quantity
 from icalib.tools.comparison.sides import LensSide, Quantity, Side, unknown

@@ -7,7 +7,7 @@ from math import floor, log10
 
 import numpy as np
 
-from icalib.base.text_files import json_text, printable
+from icalib.base.files import json_text, printable
 from icalib.tools.comparison.compare import Comparison, Difference
 
 _ALONG = 0.95  # a vector is along one axis if this component is a larger share of its norm

@@ -16,7 +16,7 @@ from icalib.tools.fleet.jobs import Job
 class InputHashes:
     """Hashes of the inputs of a job. rig: sha256 of the file. recordings: for each, sha256 of the names, sizes and
     modification times of its files, as hashing the contents would take long; the folder does not matter. program: see
-    `batch.program`."""
+    `tools.batch.program`."""
 
     rig: str
     recordings: tuple[str, ...]

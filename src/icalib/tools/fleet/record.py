@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.base.own_files import SEAL, sealed
+from icalib.base.files import SEAL, sealed
 from icalib.geometry.euler import rpy_std
 from icalib.result import Calibration, ParameterGroup, joint_covariance
 from icalib.result.quantities import nontrivial_groups

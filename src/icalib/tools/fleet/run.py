@@ -7,9 +7,7 @@ from contextlib import closing
 from math import isfinite
 from pathlib import Path
 
-from icalib.base.own_files import refuse_foreign, sealed
-from icalib.base.result_files import refuse_foreign_set
-from icalib.base.text_files import printable
+from icalib.base.files import printable, refuse_foreign, refuse_foreign_set, sealed
 from icalib.errors import CalibrationError
 from icalib.tools.batch import Crew, FailedTask, exclusive_lock, run_all, write_atomically
 from icalib.tools.fleet.drift import drift_of

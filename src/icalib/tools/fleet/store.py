@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from icalib.base.file_names import below
-from icalib.base.result_files import check_writable, finish_writing, read_file, write_files
+from icalib.base.files import below, check_writable, finish_writing, read_file, write_files
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, load_calibration
 from icalib.tools.batch import check_worker, program

@@ -7,8 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
 
-from icalib.base.own_files import DATABASE_ID
-from icalib.base.text_files import printable
+from icalib.base.files import DATABASE_ID, printable
 from icalib.errors import CalibrationError
 from icalib.geometry.euler import rpy
 from icalib.result.quantities import TURNS

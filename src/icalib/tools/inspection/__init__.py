@@ -1,8 +1,175 @@
-"""Inspection of a recording: its sensors, whether it can be calibrated, and a first draft of its rig file."""
+"""Inspection of a recording: its sensors, whether it can be calibrated, and a first draft of its rig file.
 
+Reads a recording and collects its facts; `findings` derives problems and warnings from them.
+
+Finds the topics that are sensors, and names the sensors. Reads the target that a user gives: a target or rig file of
+icalib, or Kalibr's target file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from icalib.base.yaml_nodes import read_yaml
+from icalib.data.recordings import Recording, TopicInfo, open_recording
+from icalib.errors import RecordingError, RigError
+from icalib.rig.file import load_rig, load_target
 from icalib.tools.inspection.draft import draft_rig, write_draft
-from icalib.tools.inspection.facts import Finding, GivenTarget, Inspection
-from icalib.tools.inspection.inspect import inspect_recording
-from icalib.tools.inspection.targets import read_target
+from icalib.tools.inspection.facts import Finding, FramePair, GivenTarget, Inspection, Sources, StreamFacts, timing_of
+from icalib.tools.inspection.findings import findings
+from icalib.tools.inspection.kalibr import KalibrFiles, find_kalibr_files, kalibr_target, yaml_mapping
+from icalib.tools.inspection.kinds import Key, Progress, inspectors
 
 __all__ = ["Finding", "GivenTarget", "Inspection", "draft_rig", "inspect_recording", "read_target", "write_draft"]
+
+
+READING_SHARE = 0.3  # progress after reading, if the target is then searched for
+
+
+def inspect_recording(
+    path: str | Path,
+    target: GivenTarget | None = None,
+    progress: Progress = lambda *_: None,
+    *,
+    start_s: float = 0.0,
+    end_s: float = inf,
+) -> Inspection:
+    """Reads the recording at `path`: its sensors, and whether it can be calibrated. start_s, end_s: part that is read,
+    s after the start.
+
+    The `target`, or that of a Kalibr file beside the recording, is searched for in all images; `calibrate` uses the
+    found corners again. Raises RecordingError, one sentence, if there is no recording or it is empty. Faults of single
+    topics become findings.
+    """
+    recording = open_recording(path, start_s, end_s)
+    topics = recording.topics()
+    if not any(t.count for t in topics):
+        raise RecordingError(
+            f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
+        )
+    kinds, sources, kalibr = inspectors(), find_sources(topics), find_kalibr_files(Path(path))
+    for kind in kinds.values():
+        sources = kind.joined(recording, sources)
+    target = target or _beside(kalibr)
+    share = READING_SHARE if target else 1.0
+    streams, content = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
+    sensors = sources.sensors.items()
+    facts = {name: kinds[s.kind].facts(recording, name, s, content.get(name)) for name, s in sensors}
+    inspection = Inspection(str(path), sources, streams, facts, _choose(facts, sources, kalibr), target, kalibr)
+    frames, frame_notes = _frames(recording)
+    for kind in kinds.values():
+        seen = kind.searched(recording, inspection, lambda what, done: progress(what, share + (1.0 - share) * done))
+        inspection = dataclasses.replace(inspection, facts={**inspection.facts, **seen})
+    notes = tuple(dict.fromkeys(recording.notes() + frame_notes)) + kalibr.notes
+    inspection = dataclasses.replace(inspection, frames=frames, notes=notes)
+    return dataclasses.replace(inspection, findings=findings(inspection))
+
+
+def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
+    """The target of a Kalibr file beside the recording; None without one."""
+    return GivenTarget(kalibr.target, kalibr.target_file) if kalibr.target else None
+
+
+def _read(
+    recording: Recording, topics: tuple[TopicInfo, ...], sources: Sources, progress: Progress
+) -> tuple[tuple[StreamFacts, ...], dict[str, Any]]:
+    """Reads every topic once. Returns facts by topic, and on the content of messages by name of the sensor. Topics that
+    are no `SensorSource.read_topic` are read only for their stamps."""
+    names = {source.read_topic: name for name, source in sources.sensors.items()}
+    content: dict[str, Any] = {}
+    streams: list[StreamFacts] = []
+    for k, topic in enumerate(topics):
+        progress(f"reading {topic.name}", k / len(topics))
+        if (name := names.get(topic)) is not None:
+            source = sources.sensors[name]
+            stream, content[name] = inspectors()[source.kind].read(recording, name, source)
+        else:
+            stream = _read_stamps(recording, topic, topic.name in sources.left_out)
+        streams.append(stream)
+    return tuple(streams), content
+
+
+def _frames(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
+    """Pairs of frames that kinds of sensors read poses from, and notes, see `KindInspector.frames`."""
+    pairs, notes = list[FramePair](), list[str]()
+    for inspector in inspectors().values():
+        frames, sentences = inspector.frames(recording)
+        pairs += frames
+        notes += sentences
+    return tuple(pairs), tuple(notes)
+
+
+def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
+    """Facts on a topic from its stamps. Timing is None for topics that icalib does not read, CameraInfo, transforms and
+    images that are left out."""
+    kinds_without_timing = (
+        "",
+        "camera info",
+        *(kind for inspector in inspectors().values() for kind in inspector.frame_topics),
+    )
+    if left_out or not topic.count or topic.kind in kinds_without_timing:
+        return StreamFacts(topic, None)
+    try:
+        return StreamFacts(topic, timing_of(recording.stamps(topic.name)))
+    except RecordingError as error:
+        return StreamFacts(topic, None, str(error))
+
+
+def _choose(facts: dict[str, Any], sources: Sources, kalibr: KalibrFiles) -> str | None:
+    """Name of the IMU to calibrate with. An IMU without a problem is preferred, then one in Kalibr's file, then the
+    first. None without a readable one."""
+    kinds, in_file = inspectors(), {k.topic.strip("/") for k in kalibr.imus}
+    readable = {n: s.topic.name for n, s in sources.sensors.items() if kinds[s.kind].sensor.is_inertial and facts[n]}
+    order = sorted(readable, key=lambda n: (bool(facts[n].problem), readable[n].strip("/") not in in_file))
+    return order[0] if order else None
+
+
+_UNNAMEABLE = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+def find_sources(topics: Sequence[TopicInfo]) -> Sources:
+    """The sensors among the topics with messages, each under a unique name derived from its topic."""
+    filled = [t for t in topics if t.count]
+    kinds = sorted(inspectors().values(), key=lambda kind: not kind.named_first)
+    keyed = [(key, source, kind.prefix) for kind in kinds for key, source in kind.sources(filled)]
+    names = _names([(key, prefix) for key, _, prefix in keyed])
+    sensors = {name: source for name, (_, source, _) in zip(names, keyed, strict=True)}
+    left_out = {topic: why for kind in kinds for topic, why in kind.left_out(filled, sensors).items()}
+    return Sources(sensors, left_out)
+
+
+def _names(sensors: list[tuple[Key, str]]) -> list[str]:
+    """Unique names from the last parts of the sensors' keys, as few as make the names differ."""
+    longest = max((len(key) for key, _ in sensors), default=1)
+    names: list[str] = []
+    for length in range(1, longest + 1):
+        names = [_name(key[-length:], kind) for key, kind in sensors]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{name}_{k}" if name in names[:k] else name for k, name in enumerate(names)]
+
+
+def _name(parts: Key, kind: str) -> str:
+    name = _UNNAMEABLE.sub("_", "_".join(parts)).strip("_-")
+    if not name:
+        return f"{kind}0"
+    return name if name[0].isalpha() else f"{kind}_{name}"
+
+
+def read_target(path: Path) -> GivenTarget:
+    """The target in `path`. Raises RigError, one sentence naming file, line and field."""
+    if not path.exists():
+        raise RigError(f"{path} does not exist; check the path of the target.")
+    root = read_yaml(path)
+    fields = root.entries()
+    if "target_type" in yaml_mapping(path):
+        return GivenTarget(kalibr_target(yaml_mapping(path), str(path)), str(path))
+    if "sensors" in fields:
+        rig = load_rig(path)
+        return GivenTarget(rig.target, str(path), rig.sensors)
+    return GivenTarget(load_target(path), str(path))

@@ -8,13 +8,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from icalib.base.staging import staged
-from icalib.base.text_files import write_text
-from icalib.base.writing import writing
+from icalib.base.files import staged, write_text, writing
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Scene
 from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kinds import (
+    comment,
     independent,
     inertial,
     inspectors,
@@ -23,9 +22,9 @@ from icalib.tools.inspection.kinds import (
     moving,
     named,
     nouns,
+    number,
     problem_of,
 )
-from icalib.tools.inspection.rig_lines import comment, number
 
 _TEMPLATE = """\
 # FILL IN the target: count, and measure the print itself with a ruler or a caliper, over as many tags or squares as you

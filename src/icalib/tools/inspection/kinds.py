@@ -1,13 +1,16 @@
 """Base class of the inspectors, which recognise the sensors of one kind in a recording.
 
 The inspector of a kind is `icalib.sensors.KIND.inspect.INSPECTOR`.
+
+Formats values for the lines of a drafted rig file. Frame ids of messages.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import PurePosixPath
 from typing import Any, ClassVar, Literal
@@ -16,12 +19,13 @@ import numpy as np
 from rich.table import Table
 from rich.text import Text
 
-from icalib.data.images.unreadable import VIDEO_FILE
-from icalib.data.recordings import Recording, TopicInfo
+from icalib.base.input_files import VIDEO_FILE
+from icalib.data.recordings import BagRecording, Recording, TopicInfo
+from icalib.data.tables.table import table_files
+from icalib.errors import RecordingError
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.facts import Finding, FramePair, Inspection, SensorSource, Sources, StreamFacts
-from icalib.tools.inspection.rig_lines import place_line
 
 Key = tuple[str, ...]  # parts of the name of a topic that tell sensors apart
 Subject = Literal["use", "quality", "clock", "gaps", "target"]
@@ -118,7 +122,7 @@ class KindInspector:
         return False
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
-        """Figures of one sensor as plain data, see `figures.figures`."""
+        """Figures of one sensor as plain data, see `console.figures`."""
         source = inspection.sources.sensors[name]
         return {"type": source.kind, "topic": source.topic.name} | plain(inspection.facts.get(name))
 
@@ -219,3 +223,49 @@ def plain(value: Any) -> dict[str, Any]:
     if value is None:
         return {}
     return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in dataclasses.asdict(value).items()}
+
+
+_PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")
+
+
+def place_line(name: str, kind: str, frame: str = "") -> str:
+    """The line `topic: NAME` for a topic of a bag or a folder of images, `path: NAME` for a table. kind, frame: type
+    and frame id, for a comment."""
+    endings = (".csv", *(PurePosixPath(table.name).suffix for table in table_files()))
+    field = "path" if name.removesuffix(".gz").endswith(endings) else "topic"
+    return f"{field}: {name_text(name)}  # {comment(kind)}" + in_frame(frame)
+
+
+def in_frame(frame: str) -> str:
+    """End of a comment with the frame id; "" without one."""
+    return f", frame {json.dumps(frame)}" if frame else ""
+
+
+def name_text(name: str) -> str:
+    """The name of a topic or file, in quotes if YAML needs them."""
+    return name if _PLAIN.fullmatch(name) else json.dumps(name)
+
+
+def numbers(values: Iterable[float]) -> str:
+    return f"[{', '.join(map(number, values))}]"
+
+
+def number(value: float) -> str:
+    return repr(float(value))
+
+
+def comment(text: str) -> str:
+    """`text` on one line, for a comment."""
+    return " ".join(text.split())
+
+
+def frame_id(recording: Recording, topic: TopicInfo) -> str:
+    """The frame id of the first message; empty in folders."""
+    if not isinstance(recording, BagRecording):
+        return ""
+    first: Iterator = recording.messages(topic.name, topic.kind)
+    try:
+        _, message = next(first)
+    except (RecordingError, StopIteration):
+        return ""
+    return str(message.header.frame_id)

@@ -11,10 +11,10 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.tools.montecarlo.study import Study
-from icalib.tools.montecarlo.summary import Consistency
-from icalib.tools.montecarlo.words import (
+from icalib.tools.montecarlo.summary import (
     HEADERS,
     NUMBERS,
+    Consistency,
     answer,
     block_row,
     failures_words,

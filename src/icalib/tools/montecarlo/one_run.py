@@ -1,4 +1,8 @@
-"""One run: simulate, calibrate, compare with the truth. Exceptions become part of the record of the run."""
+"""One run: simulate, calibrate, compare with the truth. Exceptions become part of the record of the run.
+
+Errors of a result, as the perturbations that its covariance describes. Whiteness of residuals: lag-one autocorrelation
+of whitened residuals in time.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +12,12 @@ from typing import Literal
 
 import numpy as np
 
+from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, Visited
+from icalib.sensors.records import Successive
 from icalib.tools.batch import program, sentence_on
-from icalib.tools.montecarlo.record import GroupErrors, RunRecord, Size, Waypoint
-from icalib.tools.montecarlo.truth import error, true_value
-from icalib.tools.montecarlo.whiteness import whiteness
+from icalib.tools.montecarlo.record import GroupErrors, RunRecord, Size, Waypoint, Whiteness
 from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
 
 GuessKind = Literal["none", "drawn"]
@@ -90,3 +94,33 @@ def _waypoint(blocks: tuple[GroupErrors, ...], truth: Truth, visit: Visited) -> 
         errors.append(error(b.name, visit.values[b.sensor, b.name], true))
         deviations.append(visit.std[b.sensor, b.name])
     return Waypoint(visit.stage, np.concatenate(errors), np.concatenate(deviations))
+
+
+def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
+    """True value of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None if the truth has none, as
+    for the tilt of a target."""
+    return truth.values.get(sensor, {}).get(name)
+
+
+def error(name: str, value: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(n,) estimated minus true; for rotations e of R_estimated = R_true Exp(e) [rad], in the sensor's axes."""
+    return so3.log(np.ascontiguousarray(true.T @ value)) if name == "rotation" else value - true
+
+
+def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
+    """Whiteness of each kind of residual in `result`."""
+    return tuple(
+        _statistics(r.sensor, name, rows)
+        for r in result.residuals.values()
+        for name, rows in r.successive().items()
+        if len(rows.whitened)
+    )
+
+
+def _statistics(sensor: str, kind: str, rows: Successive) -> Whiteness:
+    """Mean square of whitened residuals, and correlation of each with its successor."""
+    values = rows.whitened
+    first, second = values[:-1][rows.follows], values[1:][rows.follows]
+    mean_square = float(np.mean(values**2)) if values.size else 0.0
+    power = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    return Whiteness(sensor, kind, mean_square, float((first * second).sum()) / power if power > 0.0 else 0.0)

@@ -11,12 +11,12 @@ from icalib.report.page import document, plot_place, resource
 from icalib.report.plot import COLORS, Figure, axis, figure, numbers
 from icalib.report.tables import Html, element, html, sentences, table
 from icalib.tools.montecarlo.record import RunRecord
-from icalib.tools.montecarlo.statistics import Nees
 from icalib.tools.montecarlo.store import Identity
-from icalib.tools.montecarlo.summary import Consistency
-from icalib.tools.montecarlo.words import (
+from icalib.tools.montecarlo.summary import (
     HEADERS,
     NUMBERS,
+    Consistency,
+    Nees,
     answer,
     block_row,
     chance_words,

@@ -6,7 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.base.writing import writing
+from icalib.base.files import writing
 from icalib.errors import CalibrationError
 from icalib.result.provenance import versions
 from icalib.tools.batch import check_worker, program, write_atomically

@@ -1,23 +1,25 @@
-"""A Monte-Carlo study: runs of one scenario with different seeds, and their summary. A rerun resumes it."""
+"""A Monte-Carlo study: runs of one scenario with different seeds, and their summary. A rerun resumes it.
+
+Runs of a study on many cores or machines.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from icalib.base.own_files import refuse_foreign, sealed
-from icalib.base.text_files import printable
+from icalib.base.files import printable, refuse_foreign, sealed
 from icalib.errors import CalibrationError
-from icalib.tools.batch import Crew, exclusive_lock, write_atomically
-from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, RunTask
+from icalib.tools.batch import Crew, FailedTask, exclusive_lock, write_atomically
+from icalib.tools.batch import run_all as run_tasks
+from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, RunTask, run
 from icalib.tools.montecarlo.page import study_html
 from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.store import Identity, RunStore
 from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
-from icalib.tools.montecarlo.workers import run_all
 from icalib.tools.simulation import Drive, Scenario, load_scenario
 
 Progress = Callable[[str, float], None]
@@ -118,3 +120,12 @@ def _fill(
 
 def _words(done: int, seeds: range) -> str:
     return f"{done} of {len(seeds)} runs"
+
+
+def run_all(
+    tasks: Iterable[RunTask], workers: int | None = None, scheduler: str | None = None
+) -> Generator[RunRecord, None, None]:
+    """Yields the records as they finish, in any order. A run whose worker died repeatedly has a failed record with an
+    empty `program`. Raises the errors of `icalib.tools.batch.run_all`."""
+    for task, record in run_tasks(run, tasks, Crew(workers, scheduler)):
+        yield RunRecord(task.seed, record.sentence, 0.0, "") if isinstance(record, FailedTask) else record

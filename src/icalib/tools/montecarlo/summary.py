@@ -1,7 +1,11 @@
-"""Summary of the runs of a study, computed from their records.
+"""Consistency of errors and covariances over many runs: NEES, and sampled against predicted covariance.
+
+Summary of the runs of a study, computed from their records.
 
 Statistics exclude entries that are unusable in a run, which means unobservable or too uncertain: their formal standard
 deviation is that of a guess, or of a problem linearised too far from the truth.
+
+Figures of a study as text, in degrees, millimetres and milliseconds.
 """
 
 from __future__ import annotations
@@ -12,10 +16,123 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 
 import numpy as np
+from scipy.special import erf, gammaincinv
 
+from icalib.result.quantities import format_number
 from icalib.result.verdict import UNUSABLE
+from icalib.sensors.parameter_spec import display_unit
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
-from icalib.tools.montecarlo.statistics import Largest, Nees, Sample, Spread, largest, nees, spread
+
+PROBABILITY = 0.95  # that a consistent covariance has its statistic within the bounds
+LEAST_VARIANCE = 1e-13  # smallest eigenvalue of a correlation matrix: below it is rounding
+DRAWS = 400  # simulated studies, from which the bounds of the sampled covariance are found
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Error (m,) and covariance (m, m) of some entries of one run."""
+
+    seed: int
+    error: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class Nees:
+    """Normalised estimation error squared. mean: of e^T P^-1 e per degree of freedom, 1 for a consistent covariance;
+    low, high: its bounds for a consistent covariance; worst_seed, worst: the run with the largest value."""
+
+    mean: float
+    low: float
+    high: float
+    worst_seed: int
+    worst: float
+
+    @property
+    def consistent(self) -> bool:
+        return self.low <= self.mean <= self.high
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Ratios of sampled to predicted standard deviation: square roots of the smallest and largest generalised
+    eigenvalue of the two covariances, each with its bounds for a consistent covariance. They approach 1 if the
+    covariance is consistent and the runs are many."""
+
+    least: float
+    least_bounds: tuple[float, float]
+    largest: float
+    largest_bounds: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Largest:
+    """The largest of `numbers` errors. sigmas: error in standard deviations; entry, seed: its name and run.
+
+    chance: upper bound of the probability of such an error for consistent covariances. Dependence between the errors
+    makes the probability smaller.
+    """
+
+    sigmas: float
+    entry: str
+    seed: int
+    numbers: int
+    chance: float
+
+
+def nees(samples: list[Sample], probability: float = PROBABILITY) -> Nees:
+    """NEES of samples, which may differ in dimension: its sum is chi^2-distributed with the sum of the dimensions.
+    probability: that the NEES of a consistent covariance is within the bounds."""
+    each = np.array([_squared(s.error, s.covariance) for s in samples])
+    dof = sum(len(s.error) for s in samples)
+    low, high = gammaincinv(dof / 2, [0.5 - 0.5 * probability, 0.5 + 0.5 * probability]) / (dof / 2)
+    per_dof = each / [len(s.error) for s in samples]
+    worst = int(np.argmax(per_dof))
+    return Nees(float(each.sum()) / dof, float(low), float(high), samples[worst].seed, float(per_dof[worst]))
+
+
+def largest(errors: Sequence[tuple[float, str, int]]) -> Largest:
+    """The largest of errors (error in standard deviations, entry, seed). For jointly normal errors, P(all |z| < c) is
+    at least the product of the single probabilities (Sidak, JASA 62, 1967)."""
+    z, entry, seed = max(errors, key=lambda error: abs(error[0]))
+    return Largest(abs(z), entry, seed, len(errors), float(1.0 - erf(abs(z) / np.sqrt(2.0)) ** len(errors)))
+
+
+def _squared(e: np.ndarray, P: np.ndarray) -> float:
+    """e^T P^-1 e."""
+    return float((np.linalg.solve(_factor(P), e) ** 2).sum())
+
+
+def spread(samples: list[Sample]) -> Spread | None:
+    """Spread of samples; None if they differ in dimension, or are too few for a sampled covariance of full rank."""
+    n = len(samples[0].error)
+    if len(samples) <= n or any(len(s.error) != n for s in samples):
+        return None
+    predicted = np.mean([s.covariance for s in samples], axis=0)
+    roots = _roots(np.array([s.error for s in samples]), predicted)
+    rng = np.random.default_rng(0)
+    factors = np.array([_factor(s.covariance) for s in samples])
+    drawn = [
+        _roots(np.einsum("kij,kj->ki", factors, rng.standard_normal((len(samples), n))), predicted)
+        for _ in range(DRAWS)
+    ]
+    low, high = np.quantile(drawn, [0.5 - 0.5 * PROBABILITY, 0.5 + 0.5 * PROBABILITY], axis=0)
+    return Spread(float(roots[0]), (float(low[0]), float(high[0])), float(roots[-1]), (float(low[-1]), float(high[-1])))
+
+
+def _roots(errors: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """(n,) square roots of the generalised eigenvalues of the mean of e e^T and `predicted` (n, n), ascending; errors
+    (N, n)."""
+    whitened = np.linalg.solve(_factor(predicted), errors.T)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(whitened @ whitened.T / len(errors)), 0.0))
+
+
+def _factor(P: np.ndarray) -> np.ndarray:
+    """L with L L^T = P. Entries are scaled first, since radians beside pixels make a badly conditioned matrix. A
+    direction without variance gets LEAST_VARIANCE, so that an error in it counts as huge."""
+    sigma = np.sqrt(np.diag(P))
+    values, vectors = np.linalg.eigh(P / np.outer(sigma, sigma))
+    return sigma[:, None] * vectors * np.sqrt(np.maximum(values, LEAST_VARIANCE))
 
 
 @dataclass(frozen=True)
@@ -189,3 +306,90 @@ def _means(figures: list[tuple[str, str, float, float]]) -> tuple[Mean, ...]:
         error = np.std(amounts - mean * weights, ddof=1) / (weights.mean() * np.sqrt(n)) if n > 1 else 0.0
         out.append(Mean(sensor, kind, float(mean), float(error)))
     return tuple(out)
+
+
+HEADERS = ("block", "dim", "runs", "NEES", "95 %", "RMSE", "mean sigma", "unit", "sampled / predicted")
+NUMBERS = HEADERS[1:7] + HEADERS[8:]
+
+
+def block_row(block: BlockSummary) -> tuple[str, ...]:
+    """Cells of one block under `HEADERS`."""
+    unit, scale = display_unit(block.unit)
+    sizes = ["" if x is None else format_number(scale * x, 3) for x in (block.rmse, block.mean_sigma)]
+    return (
+        f"{block.sensor} {block.name.replace('_', ' ')}",
+        str(block.dimension),
+        str(block.runs),
+        *nees_cells(block.nees),
+        *sizes,
+        unit,
+        spread_words(block.spread),
+    )
+
+
+def nees_cells(nees: Nees | None) -> tuple[str, str]:
+    """Mean NEES per degree of freedom, and its bounds."""
+    return ("", "") if nees is None else (f"{nees.mean:.3f}", f"{nees.low:.2f}-{nees.high:.2f}")
+
+
+def spread_words(spread: Spread | None) -> str:
+    return "" if spread is None else f"{spread.least:.2f}-{spread.largest:.2f}"
+
+
+def chance_words(spread: Spread | None) -> str:
+    """Bounds of the spread for a consistent covariance, smallest then largest; "" without a spread."""
+    if spread is None:
+        return ""
+    (a, b), (c, d) = spread.least_bounds, spread.largest_bounds
+    return f"{a:.2f}-{b:.2f}, {c:.2f}-{d:.2f}"
+
+
+def verdict_words(block: BlockSummary) -> str:
+    """Number of runs of each verdict, for the entries that are not determined in every run."""
+    odd = []
+    for entry in block.entries:
+        if set(entry.verdicts) - {"determined"}:
+            odd.append(f"{entry.label}: {', '.join(f'{n} {v}' for v, n in entry.verdicts.items())}")
+    return "; ".join(odd) or "determined in all"
+
+
+def mean_cells(mean: Mean) -> tuple[str, str, str]:
+    return mean.sensor, mean.kind, f"{mean.mean:.3f} +- {mean.standard_error:.3f}"
+
+
+def answer(consistency: Consistency) -> str:
+    """The result of the study in one sentence: how many blocks have a NEES within its bounds."""
+    counted = [b for b in consistency.blocks if b.nees is not None]
+    if not counted:
+        return "No run reached a result."
+    out = [b.key for b in counted if b.nees is not None and not b.nees.consistent]
+    by_chance = (1.0 - PROBABILITY) * len(counted)
+    inside = f"{len(counted) - len(out)} of {len(counted)} blocks have their mean NEES within its 95 % bounds"
+    named = f"; outside: {', '.join(out)}" if out else ""
+    return f"{inside}; {by_chance:.1f} are expected outside by chance{named}."
+
+
+def largest_words(consistency: Consistency) -> str:
+    """A sentence on the largest single error, and its probability by chance."""
+    one = consistency.largest
+    if one is None:
+        return "No number was determined in any run."
+    share = "less than 1" if one.chance < 0.01 else f"at most {100 * one.chance:.0f}"
+    return (
+        f"The largest error of {one.numbers} numbers is {one.sigmas:.1f} standard deviations ({one.entry}, "
+        f"seed {one.seed}); by chance alone {share} of 100 studies would reach it."
+    )
+
+
+def failures_words(consistency: Consistency) -> str:
+    if not consistency.failures:
+        return f"All {consistency.runs} runs reached a result."
+    return (
+        f"{len(consistency.failures)} of {consistency.runs} runs failed, and are excluded from the rest of this page."
+    )
+
+
+def unobservable_words(consistency: Consistency) -> list[str]:
+    """A line for each unobservable combination, with the number of runs in which it was unobservable."""
+    reached = consistency.runs - len(consistency.failures)
+    return [f"{n} of {reached} runs: {what}" for what, n in consistency.unobservable.items()]

@@ -13,7 +13,7 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import RigError
 from icalib.tools.simulation.images.filming import Film
 from icalib.tools.simulation.images.rendering import Imaging
-from icalib.tools.simulation.output.bag_writer import IMAGE, IMU, IMU_TOPIC, BagWriter
+from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagWriter
 from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
 from icalib.tools.simulation.tables import atomic_output, write_truth

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.base.file_names import below
-from icalib.base.staging import staged
+from icalib.base.files import below, staged
 from icalib.data.measurements import CornerStream, ImuStream, TrackStream
 from icalib.errors import RecordingError
-from icalib.tools.simulation.output.csv_table import write_table
+from icalib.tools.simulation.output import write_table
 from icalib.tools.simulation.scenario.scenario import Scenario
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth
 

@@ -10,10 +10,10 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from icalib.base.file_names import below
+from icalib.base.files import below
 from icalib.errors import RecordingError
 from icalib.tools.simulation.images.filming import Film, Shot
-from icalib.tools.simulation.output.bag_writer import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package
+from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package
 
 Form = BagForm | Literal["euroc"]
 FORMS: tuple[Form, ...] = ("ros1", "mcap", "sqlite3", "euroc")

@@ -1,8 +1,13 @@
-"""Shows the recording of a result: IMU readings, images and scans, placed by the calibration."""
+"""Shows the recording of a result: IMU readings, images and scans, placed by the calibration.
+
+Curves over time: residuals, velocity and biases. Poses of the body at any instant, interpolated between the keyframes
+of a result.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -12,15 +17,16 @@ import numpy as np
 
 from icalib.data.recordings import DamagedImageError, Recording, decode
 from icalib.errors import CalibrationError, RecordingError
+from icalib.geometry import so3
+from icalib.geometry.vectors import hermite
+from icalib.report.plot import AXIS_COLORS, COLORS, REJECTED
+from icalib.report.residual_views import curves
 from icalib.result import Calibration, RecordingSpan
 from icalib.rig import Rig
 from icalib.sensors import call_all_kinds, call_kind
 from icalib.sensors.sensor import Sensor
-from icalib.tools.view.colors import by_value
-from icalib.tools.view.path import CubicPath
 from icalib.tools.view.scene import POINT, place
-from icalib.tools.view.series import log_lines
-from icalib.tools.view.stream import RerunStream
+from icalib.tools.view.stream import RerunStream, by_value, rgb
 
 MOST_READINGS = 100_000  # shown of an IMU
 MOST_IMAGES = 600  # shown of a camera
@@ -199,3 +205,114 @@ def _stride(count: int, most: int) -> int:
 def _thinned(name: str, count: int, most: int, what: str) -> list[str]:
     stride = _stride(count, most)
     return [f"{name}: one in {stride} of its {count} {what} is shown."] if stride > 1 else []
+
+
+_DOT = 3.0  # radius, in screen points
+_GOOD, _LEFT_OUT = "#22c55e", "#9ca3af"
+
+
+def log_residuals(s: RerunStream, c: Calibration) -> None:
+    """Sends the residuals of all sensors over time, and for cameras also the measured image points."""
+    for r in c.residuals.values():
+        for curve in curves(c, r):
+            name = re.sub(r"[^0-9a-zA-Z]+", "_", curve.name)
+            entity = f"residuals/{r.sensor}/{name}" if name else f"residuals/{r.sensor}"
+            log_lines(s, entity, curve.seconds, curve.values, curve.labels)
+    _log_observations(s, c)
+
+
+def log_states(s: RerunStream, c: Calibration) -> None:
+    """Sends velocity [m/s] and biases [deg/s, m/s^2] at the keyframes; nothing without an IMU."""
+    path = c.trajectory
+    if c.imu is None:
+        return
+    log_lines(s, "motion/velocity", path.seconds, path.velocity, "xyz")
+    log_lines(s, "motion/gyro_bias", path.seconds, np.rad2deg(path.gyro_bias), "xyz")
+    log_lines(s, "motion/accel_bias", path.seconds, path.accel_bias, "xyz")
+
+
+def log_lines(s: RerunStream, entity: str, seconds: np.ndarray, values: np.ndarray, names: Sequence[str]) -> None:
+    """Sends curves over time. seconds (n,); values (n, m): a column for each of the m names."""
+    colors = AXIS_COLORS if len(names) == 3 else COLORS[: len(names)]
+    s.still(entity, s.rr.SeriesLines(names=list(names), colors=rgb(*colors)))
+    n, m = values.shape
+    s.over(entity, seconds, s.rr.Scalars.columns(scalars=values.reshape(-1)).partition([m] * n))
+
+
+def _log_observations(s: RerunStream, c: Calibration) -> None:
+    """Sends measured corners and tracked points in the images; rejected ones are red, those of unused tracks grey."""
+    rr = s.rr
+    for r in c.image_residuals:
+        entity = f"{place(c, r.sensor)}/image/{r.kind}"
+        s.still(entity, rr.Points2D.from_fields(radii=rr.Radius.ui_points(_DOT)))
+        colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]
+        columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
+        s.over(entity, r.seconds, columns)
+
+
+LONGEST_STEP_S = 0.5  # longest interval between keyframes in which poses are interpolated
+_AT_KEYFRAME_S = 1e-6  # an instant this close to a keyframe has its pose
+
+
+@dataclass(frozen=True)
+class CubicPath:
+    """Cubic Hermite interpolation between K keyframes: of positions, and of the rotation vector from each keyframe to
+    the next.
+
+    The slopes at a keyframe are those of the parabola through it and its neighbours; the slope of the rotation is the
+    angular rate in the body's axes. seconds: on the clock of the result. usable (K - 1,) bool: whether poses in the
+    interval are known.
+    """
+
+    seconds: np.ndarray  # (K,)
+    rotation: np.ndarray  # (K, 3, 3) R_world_body
+    position: np.ndarray  # (K, 3) m, world
+    turn: np.ndarray  # (K - 1, 3) rad
+    rate: np.ndarray  # (K, 3) rad/s
+    slope: np.ndarray  # (K, 3) m/s
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, c: Calibration) -> CubicPath:
+        path = c.trajectory
+        step = np.diff(path.seconds)
+        usable = (np.diff(c.recording_of(path.seconds)) == 0) & (step <= LONGEST_STEP_S)
+        between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
+        turn = so3.log_many(np.ascontiguousarray(between))
+        rate = _slopes(turn / step[:, None], step, usable)
+        slope = _slopes(np.diff(path.position, axis=0) / step[:, None], step, usable)
+        return cls(path.seconds, path.rotation, path.position, turn, rate, slope, usable)
+
+    def at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """R_world_body (n, 3, 3), p_world_body (n, 3) m at `seconds` (n,) of the result, and (n,) bool: which of them
+        are known. The others are those of the nearest keyframe."""
+        last = max(len(self.seconds) - 2, 0)
+        k = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, last)
+        h = self.seconds[k + 1] - self.seconds[k]
+        s = np.clip((seconds - self.seconds[k]) / h, 0.0, 1.0)
+        nearest = np.where(s < 0.5, k, k + 1)
+        at_keyframe = np.abs(seconds - self.seconds[nearest]) <= _AT_KEYFRAME_S
+        inside = self.usable[k] & (seconds >= self.seconds[0]) & (seconds <= self.seconds[-1])
+        s = np.where(inside, s, np.round(s))[:, None]
+        turn = self.turn[k]
+        # The rate at the later keyframe as a derivative of the rotation vector: inverse right Jacobian, second order.
+        far = self.rate[k + 1]
+        far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
+        phi = hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
+        chord = self.position[k + 1] - self.position[k]
+        displacement = hermite(s, chord, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
+        R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
+        return R, self.position[k] + displacement, inside | at_keyframe
+
+
+def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:
+    """(K, 3) slopes at the keyframes, from the mean slopes `between` (K - 1, 3) over steps (K - 1,) s; those that are
+    not `usable` have no weight."""
+    weight = np.zeros((2, len(step) + 1))  # of the intervals before and after each keyframe
+    weight[0, 1:], weight[1, :-1] = usable, usable
+    i = np.flatnonzero((weight > 0.0).all(axis=0))
+    weight[0, i], weight[1, i] = step[i], step[i - 1]
+    padded = np.zeros((2, len(step) + 1, 3))
+    padded[0, 1:], padded[1, :-1] = between, between
+    total = np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
+    return (weight[:, :, None] * padded).sum(axis=0) / total[:, None]

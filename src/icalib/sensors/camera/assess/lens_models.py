@@ -17,7 +17,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.cameras.lens_bundle import Adjusted, ImagePoints, adjust, initial_parameters
+from icalib.geometry.cameras.convert import Adjusted, ImagePoints, adjust, initial_parameters
 from icalib.motion.factor import pairs_of
 from icalib.observability.cause import Cause
 from icalib.optim.state import State

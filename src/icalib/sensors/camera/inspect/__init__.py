@@ -1,4 +1,7 @@
-"""Finds cameras in a recording for `icalib inspect`: images, tables of corners and tracks, and what they show."""
+"""Finds cameras in a recording for `icalib inspect`: images, tables of corners and tracks, and what they show.
+
+Finds cameras among the topics of a recording. Tables of cameras for the terminal.
+"""
 
 from __future__ import annotations
 
@@ -10,28 +13,29 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
-from icalib.detection.images.image_work import spread_images
+from icalib.detection.images import spread_images
 from icalib.errors import RecordingError
 from icalib.sensors.camera.inspect import findings
 from icalib.sensors.camera.inspect.draft import camera_lines
 from icalib.sensors.camera.inspect.facts import (
+    GRID,
     CameraFacts,
     CameraSource,
     ImageFacts,
     camera_sources,
     camera_views,
+    read_images,
+    resolution_of,
+    target_in,
+    target_view,
     without_target,
 )
-from icalib.sensors.camera.inspect.images import read_images
-from icalib.sensors.camera.inspect.sources import camera_sources_of, depth_images
-from icalib.sensors.camera.inspect.tables import coverage_maps, target_table
-from icalib.sensors.camera.inspect.views import GRID, resolution_of, target_in, target_view
 from icalib.sensors.camera.read.camera_info import CameraInfo, read_camera_info
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import Inspection, SensorSource, StreamFacts
-from icalib.tools.inspection.kinds import Key, KindInspector, Progress, plain, problem_of
-from icalib.tools.inspection.timing import imu_timing, overlap_s
+from icalib.tools.inspection.console import plain_table
+from icalib.tools.inspection.facts import Inspection, SensorSource, StreamFacts, imu_timing, overlap_s
+from icalib.tools.inspection.kinds import Key, KindInspector, Progress, plain, problem_of, topic_key
 
 
 class CameraInspector(KindInspector):
@@ -158,3 +162,88 @@ def _with_views(
         view = target_view(recording, name, camera, target, resolution_of(inspection, name, camera), show)
         facts[name] = dataclasses.replace(inspection.facts[name], view=view)
     return facts
+
+
+Groups = Mapping[str, Mapping[Key, list[TopicInfo]]]  # topics by their kind, and by camera
+
+
+def depth_images(topics: Sequence[TopicInfo]) -> list[TopicInfo]:
+    """Topics of depth images, which show no target."""
+    return [t for t in topics if t.kind == "image" and "depth" in t.name.lower()]
+
+
+def camera_sources_of(topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, CameraSource]]:
+    """Yields the cameras by the parts of their topics that name them, sorted."""
+    depth = depth_images(topics)
+    groups = {
+        kind: _by_key([t for t in topics if t.kind == kind and t not in depth])
+        for kind in ("image", "corners", "tracks", "camera info")
+    }
+    for key in sorted({*groups["image"], *groups["corners"], *groups["tracks"]}):
+        yield key, _camera(key, groups)
+
+
+def _camera(key: Key, groups: Groups) -> CameraSource:
+    """The camera with the key `key`. Among several topics of its images, unrectified ones go first, then those with
+    most messages, then short names, which are of uncompressed images."""
+    same = sorted(groups["image"].get(key, []), key=lambda t: ("rect" in t.name, -t.count, len(t.name)))
+    corners, tracks, info = (groups[kind].get(key, [None])[0] for kind in ("corners", "tracks", "camera info"))
+    images = same[0] if same else None
+    topic = corners or images or tracks
+    assert topic is not None  # the key is of one of them
+    return CameraSource(Camera.sensor_type, topic, images, corners, info, tuple(t.name for t in same[1:]), tracks)
+
+
+def _by_key(topics: list[TopicInfo]) -> dict[Key, list[TopicInfo]]:
+    groups: dict[Key, list[TopicInfo]] = {}
+    for topic in topics:
+        groups.setdefault(topic_key(topic), []).append(topic)
+    return groups
+
+
+def target_table(inspection: Inspection) -> Table:
+    """One row for each camera: number of images with the target, coverage of the image, tilts and distances."""
+    table = plain_table(
+        f"Target ({inspection.target.target.type} of {inspection.target.file})" if inspection.target else "",
+        ("camera", "images", "with target", "corners", "cells covered", "tilt [deg]", "farthest / nearest"),
+        right=1,
+        caption=(
+            "tilt: 10th to 90th percentile of the images; tilt and distances are rough, for the intrinsics are unknown."
+        ),
+    )
+    for name, v in camera_views(inspection).items():
+        share = f" ({v.seen / v.images:.0%})" if v.images else ""
+        filled = sum(n > 0 for row in v.cells for n in row) if v.cells else None
+        table.add_row(
+            *map(
+                Text,
+                (
+                    name,
+                    "" if v.images is None else str(v.images),
+                    f"{v.seen}{share}",
+                    str(v.corners),
+                    f"{filled} of {len(v.cells) * len(v.cells[0])}" if v.cells else "",
+                    f"{v.tilt_deg[0]:.0f} to {v.tilt_deg[2]:.0f}" if v.tilt_deg else "",
+                    f"{v.distance_ratio:.1f}" if v.distance_ratio else "",
+                ),
+            )
+        )
+    return table
+
+
+def coverage_maps(inspection: Inspection) -> Iterator[Text]:
+    """The number of corners in each part of the image of each camera, with a heading."""
+    for name, view in camera_views(inspection).items():
+        if view.cells:
+            yield Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):")
+            yield Text(coverage_map(view.cells))
+
+
+def coverage_map(cells: tuple[tuple[int, ...], ...]) -> str:
+    """The grid of cells as lines of text."""
+    most = max(max(row) for row in cells) or 1
+    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in cells)
+
+
+def _digit(count: int, most: int) -> str:
+    return str(max(1, round(9 * count / most))) if count else "."

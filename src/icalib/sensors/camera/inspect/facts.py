@@ -1,13 +1,28 @@
-"""What a recording shows of its cameras, as plain data; figures that cannot be determined are None."""
+"""What a recording shows of its cameras, as plain data; figures that cannot be determined are None.
+
+Reads the images of a camera for an inspection.
+
+Detections of the target in images: their number, coverage of the image, tilts and distances.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from icalib.data.recordings import TopicInfo
+import numpy as np
+
+from icalib.data.measurements import CornerStream
+from icalib.data.recordings import DamagedImageError, Payload, Recording, TopicInfo, decode
+from icalib.detection.boards.diagnosis import checkerboard_in, tags_in
+from icalib.errors import RecordingError
+from icalib.geometry.targets import Target
+from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.camera.read.camera_info import CameraInfo
+from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.sensors.camera.spec import Camera
-from icalib.tools.inspection.facts import Inspection, SensorSource, Vector
+from icalib.tools.inspection.facts import Inspection, SensorSource, StreamFacts, Vector, timing_of
+from icalib.tools.inspection.kinds import frame_id
 
 
 @dataclass(frozen=True)
@@ -95,3 +110,148 @@ def without_target(inspection: Inspection) -> bool:
     """Whether there is an IMU and no camera shows a target, so that cameras can only track points of the scene."""
     words = patterns(inspection)
     return bool(inspection.imu and words) and not any(words.values())
+
+
+SAMPLE = 16  # images per camera that are decoded, spread over the recording
+
+
+def read_images(recording: Recording, topic: TopicInfo) -> tuple[StreamFacts, ImageFacts]:
+    """Reads all images of a topic, and decodes a sample."""
+    sample = _Sample(max(topic.count // SAMPLE, 1))
+    stamps: list[int] = []
+    problem = ""
+    try:
+        for payload in recording.payloads(topic.name):
+            stamps.append(payload.stamp_ns)
+            sample.look(payload)
+    except RecordingError as error:
+        problem = str(error)
+    if sample.decoded and sample.damaged == sample.decoded:
+        problem = problem or (
+            f"{topic.name}: none of {sample.decoded} sampled images can be decoded "
+            f"({sample.error.rstrip('.')}); check the driver, and record again."
+        )
+    frame = frame_id(recording, topic)
+    facts = ImageFacts(sample.resolution, sample.encoding, frame, sample.decoded, sample.damaged)
+    content = f"{facts.resolution[0]} x {facts.resolution[1]} {facts.encoding}" if facts.resolution else ""
+    return StreamFacts(topic, timing_of(np.array(stamps, np.int64)), problem, content), facts
+
+
+class _Sample:
+    """Decodes every n-th image, and counts those that are damaged."""
+
+    def __init__(self, every: int) -> None:
+        self._every, self._count = every, 0
+        self.decoded = self.damaged = 0
+        self.encoding = self.error = ""
+        self.resolution: tuple[int, int] | None = None
+
+    def look(self, payload: Payload) -> None:
+        self._count += 1
+        if self._count == 1:
+            self.encoding = payload.encoding
+        if self.resolution is None and payload.width:
+            self.resolution = payload.width, payload.height
+        if (self._count - 1) % self._every:
+            return
+        self.decoded += 1
+        try:
+            height, width = decode(payload).shape
+        except DamagedImageError as error:
+            self.damaged += 1
+            self.error = self.error or str(error)
+            return
+        self.resolution = self.resolution or (width, height)
+
+
+GRID = (8, 5)  # columns and rows of cells over the image
+_LEAST_CORNERS = 8  # for the tilt of a board in one image; a free tag needs its four
+
+
+def resolution_of(inspection: Inspection, name: str, camera: CameraSource) -> tuple[int, int] | None:
+    """Resolution (width, height) px of the camera's images; without images, that of the rig file with the target or of
+    Kalibr's camchain; else None."""
+    if camera.images:
+        return inspection.facts[name].images.resolution
+    stated = inspection.target.sensors.get(name) if inspection.target else None
+    if isinstance(stated, Camera):
+        return stated.resolution
+    return next((c.resolution for c in inspection.kalibr.cameras if c.name == name), None)
+
+
+def target_view(
+    recording: Recording,
+    name: str,
+    source: CameraSource,
+    target: Target,
+    resolution: tuple[int, int] | None,
+    progress: Callable[[float], None],
+) -> TargetView:
+    """Finds the target in all images of the camera, or reads the recorded corners. A failure is described in
+    `TargetView.problem`."""
+    images = source.images.name if source.images else None
+    path = source.corners.name if source.corners else f"{name}/corners.csv"
+    # The detection of corners does not depend on the camera model.
+    camera = Camera(name, path, "pinhole-radtan", resolution or (1, 1), topic=images)
+    tabled = source.corners is not None
+    try:
+        if tabled:
+            corners, notes = recorded_corners(recording, camera, target), ()
+        else:
+            corners, notes = find_corners(recording, camera, target, progress=progress)
+    except RecordingError as error:
+        return TargetView(name, None, 0, 0, None, None, None, problem=str(error))
+    count = np.diff(corners.start)
+    tilt, ratio = _poses(corners, target)
+    return TargetView(
+        name,
+        images=None if tabled else len(count),
+        seen=int((count > 0).sum()),
+        corners=len(corners.uv),
+        cells=coverage(corners.uv, resolution) if resolution else None,
+        tilt_deg=tilt,
+        distance_ratio=ratio,
+        notes=notes,
+    )
+
+
+def target_in(images: Iterable[np.ndarray]) -> str:
+    """Words on the tags or the checkerboard in images (h, w) uint8; "" for neither."""
+    grey = list(images)
+    return tags_in(grey) or checkerboard_in(grey)
+
+
+def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
+    """Number of corners uv (N, 2) [px] in each cell of an image of `resolution` (width, height): GRID[1] rows of
+    GRID[0] cells."""
+    cell = np.floor((uv + 0.5) / resolution * GRID).astype(np.int64)
+    col, row = np.clip(cell, 0, np.array(GRID) - 1).T
+    counts = np.bincount(row * GRID[0] + col, minlength=GRID[0] * GRID[1]).reshape(GRID[1], GRID[0])
+    return tuple(tuple(int(n) for n in line) for line in counts)
+
+
+def _poses(corners: CornerStream, target: Target) -> tuple[tuple[float, float, float] | None, float | None]:
+    """10th, 50th and 90th percentile of the tilt [deg], and 90th over 10th percentile of the distance; None without
+    data.
+
+    Both follow from an affine map of each body's plane to each image. A distant plane that is tilted by a has the scale
+    f / distance along the axis of the tilt, and cos(a) times this scale across it.
+    """
+    scales: list[np.ndarray] = []
+    body = target.body[corners.point]
+    order = np.lexsort((body, corners.image))
+    change = np.flatnonzero((np.diff(corners.image[order]) != 0) | (np.diff(body[order]) != 0)) + 1
+    for rows in np.split(order, change) if len(order) else []:
+        if len(rows) < (_LEAST_CORNERS if target.bends[body[rows[0]]] else 4):
+            continue
+        xy = target.points[corners.point[rows], :2]
+        design = np.column_stack([xy - xy.mean(axis=0), np.ones(len(xy))])
+        affine, _, rank, _ = np.linalg.lstsq(design, corners.uv[rows], rcond=None)
+        if rank == 3:
+            scales.append(np.linalg.svd(affine[:2], compute_uv=False))
+    if not scales:
+        return None, None
+    large, small = np.array(scales).T
+    low, middle, high = np.percentile(np.degrees(np.arccos(np.clip(small / large, 0.0, 1.0))), (10, 50, 90))
+    near, far = np.percentile(large, (90, 10))
+    return (float(low), float(middle), float(high)), float(near / far)

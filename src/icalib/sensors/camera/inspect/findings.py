@@ -14,9 +14,8 @@ from icalib.sensors.camera.inspect.facts import (
     patterns,
     without_target,
 )
-from icalib.tools.inspection.facts import Finding, Inspection
+from icalib.tools.inspection.facts import Finding, Inspection, imu_timing, overlap_s, words_on_gaps
 from icalib.tools.inspection.kinds import inertial, rolls
-from icalib.tools.inspection.timing import imu_timing, overlap_s, words_on_gaps
 
 LEAST_SHARE = 0.3  # share of images with the target
 FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 0.5  # with an IMU or wheels: 20 pairs of images at most 2 s apart

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.data.recordings.base import Reading, ReadStream, Recording
-from icalib.data.tables.files import TableFile
-from icalib.data.tables.table import read_table
+from icalib.data.tables.table import TableFile, read_table
 from icalib.data.topics import MessageType, UnreadType
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from icalib.data.messages.streams import HasMessages
+from icalib.data.messages import HasMessages
 
 
 @dataclass(frozen=True)

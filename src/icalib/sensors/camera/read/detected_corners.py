@@ -14,22 +14,28 @@ import numpy as np
 
 from icalib.data.measurements import CornerStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.detection.boards.board_diagnosis import other_columns, other_size
 from icalib.detection.boards.detectors import Detector, detector_of
-from icalib.detection.boards.diagnosis import what_is_seen, with_other_border, with_other_layout
-from icalib.detection.images.cache import keep_corners, load_corners, stream_key
-from icalib.detection.images.image_work import (
+from icalib.detection.boards.diagnosis import (
+    other_columns,
+    other_size,
+    what_is_seen,
+    with_other_border,
+    with_other_layout,
+)
+from icalib.detection.images import (
     Progress,
     batches_of,
     image_count,
+    keep_corners,
+    load_corners,
     on_all_cores,
     spread_images,
+    stream_key,
     words_on_damaged,
 )
 from icalib.detection.primitives.corners import ImageCorners, corner_stream, packed
 from icalib.detection.primitives.prediction import MOTION_IMAGES
-from icalib.detection.sightings import parts_of, sightings, without_rare_tags
-from icalib.detection.turns import number_continuously
+from icalib.detection.sightings import number_continuously, parts_of, sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.rig import Camera

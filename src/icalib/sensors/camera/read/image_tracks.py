@@ -14,12 +14,14 @@ import numpy as np
 
 from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.detection.images.cache import keep_arrays, load_kept, stream_key
-from icalib.detection.images.image_work import (
+from icalib.detection.images import (
     Progress,
     batches_of,
     image_count,
+    keep_arrays,
+    load_kept,
     on_all_cores,
+    stream_key,
     words_on_damaged,
 )
 from icalib.detection.tracking.tracker import Observations, Tracker

@@ -17,10 +17,18 @@ import numpy as np
 from icalib.base.extras import load_cv2
 from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
-from icalib.detection.images.image_work import on_all_cores
+from icalib.detection.images import on_all_cores
 from icalib.detection.tracking.epipolar import FEWEST_MATCHED_POINTS
-from icalib.detection.tracking.patches import RADIUS, align, cut_templates
-from icalib.detection.tracking.tracker import ALIGNED_PX, BACK_PX, MIN_NCC, WINDOW_PX, prepared
+from icalib.detection.tracking.tracker import (
+    ALIGNED_PX,
+    BACK_PX,
+    MIN_NCC,
+    RADIUS,
+    WINDOW_PX,
+    align,
+    cut_templates,
+    prepared,
+)
 from icalib.rig import Camera
 from icalib.sensors.camera.read.images import image_topic
 from icalib.sensors.camera.read.moving import best_lambda, from_centre, misfits

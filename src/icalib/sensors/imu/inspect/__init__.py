@@ -19,10 +19,8 @@ from icalib.sensors.imu.inspect.tables import imu_table
 from icalib.sensors.imu.read.halves import pair_of
 from icalib.sensors.imu.spec import ImuSensor
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import Inspection, Sources, StreamFacts
-from icalib.tools.inspection.frame_ids import frame_id
-from icalib.tools.inspection.kinds import Key, KindInspector, plain, topic_key
-from icalib.tools.inspection.timing import timing_of
+from icalib.tools.inspection.facts import Inspection, Sources, StreamFacts, timing_of
+from icalib.tools.inspection.kinds import Key, KindInspector, frame_id, plain, topic_key
 
 
 class ImuInspector(KindInspector):

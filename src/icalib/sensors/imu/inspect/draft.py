@@ -10,7 +10,7 @@ from icalib.sensors.imu.inspect.facts import ImuSource
 from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES, ImuNoise, TwoSources, class_noise, class_of_noise
 from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kalibr import KalibrImu
-from icalib.tools.inspection.rig_lines import comment, in_frame, name_text, number, place_line
+from icalib.tools.inspection.kinds import comment, in_frame, name_text, number, place_line
 
 
 def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[str]:

@@ -8,9 +8,8 @@ import numpy as np
 
 from icalib.motion.axes import axis_words, other_axes
 from icalib.sensors.imu.inspect.facts import ImuFacts
-from icalib.tools.inspection.facts import Finding, Inspection
+from icalib.tools.inspection.facts import Finding, Inspection, imu_timing, words_on_gaps
 from icalib.tools.inspection.kinds import independent, inertial, moving, problem_of, rolls
-from icalib.tools.inspection.timing import imu_timing, words_on_gaps
 
 STILL_RAD_S = 0.03  # RMS rate below which the IMU is at rest
 WEAK_RAD_S = 0.1  # RMS rate about one axis: below it, parameters about this axis are weakly observable

@@ -9,8 +9,7 @@ import numpy as np
 
 from icalib.data.recordings.base import Cut, Reading, ReadStream, Recording
 from icalib.data.stamps.jumps import ClockJumps
-from icalib.data.tables.files import TableFile
-from icalib.data.tables.table import holds, read_table
+from icalib.data.tables.table import TableFile, holds, read_table
 from icalib.data.topics import MessageType
 from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.read.halves import ImuHalf, ImuHalves, both, imu_source, one_stream, values_of

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.data.measurements import ImuStream
-from icalib.data.tables.axes import in_axes
+from icalib.data.tables.columns import in_axes
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.read.gravity_turns import WINDOW_S, gravity_size

@@ -8,13 +8,13 @@ from dataclasses import replace
 
 from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs, with_association
+from icalib.initialize.steps.contradicted_guesses import stated_values
 from icalib.initialize.steps.initializer import BY_SCANS, Initializer, InputsWithMotion, Values
-from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
-from icalib.sensors.lidar.initialize.association_rounds import lidar_values, state_from_lidar, with_lidars
-from icalib.sensors.lidar.initialize.degeneracy import explaining_degeneracy
+from icalib.sensors.lidar.initialize.association import lidar_values, state_from_lidar, with_lidars
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
+from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
 
 
 class LidarInitializer(Initializer[Lidar]):

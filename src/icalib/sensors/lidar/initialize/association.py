@@ -1,4 +1,9 @@
-"""Association of points with planes that several LiDARs share, repeated in each round of association and solve.
+"""Rounds of association and solve: from approximate extrinsics of LiDARs to points on planes.
+
+Cameras give the trajectory, or else the first LiDAR. All other LiDARs are aligned to it. Then points are associated
+with planes and all parameters are solved, in rounds with decreasing tolerance.
+
+Association of points with planes that several LiDARs share, repeated in each round of association and solve.
 
 Each round transforms all points to the world by the current state, finds planes there, and associates points with them.
 The tolerance allows for errors of that state. A plane keeps its name from round to round if it keeps its points.
@@ -7,19 +12,292 @@ The tolerance allows for errors of that state. A plane keeps its name from round
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.detection.planes.planes import MOST_POINTS, ExtractedPlanes, PlaneSearch, find_planes
+from icalib.detection.planes import MOST_POINTS, ExtractedPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
-from icalib.motion.plane_association import PlaneAssociation
-from icalib.motion.point_planes import count_points
-from icalib.motion.sweep import EstimatedMotion
+from icalib.estimate.estimate import first_pass
+from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
+from icalib.estimate.problem.inputs import Inputs, with_association
+from icalib.geometry.planes import plane_of
+from icalib.initialize.steps.contradicted_guesses import known_extrinsics, known_names, merged_values, stated_values
+from icalib.initialize.steps.single_recording import (
+    KnownExtrinsics,
+    converted_offset,
+    fullest_recording,
+    naming_recording,
+    offset_of_each_clock,
+    single_recording,
+    state_of_recording,
+    states_from_best,
+)
+from icalib.motion.known_motion import are_near_keyframes
+from icalib.motion.plane_association import PlaneAssociation, joined_associations
+from icalib.motion.point_planes import are_somewhere, count_points, thinned
+from icalib.motion.sweep import EstimatedMotion, sweep
+from icalib.motion.time_offsets import instants
 from icalib.optim.arrowhead import in_parallel
-from icalib.optim.state import Key
-from icalib.sensors.lidar.binning import in_world
+from icalib.optim.state import Key, State
+from icalib.sensors.lidar.binning import COARSE_BIN_S, AssociatedPoints, LidarNoise, Moments, in_world, take_moments
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
+from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
+from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
+from icalib.sensors.sensor import MOUNTED_NAMES
+
+# The rounds diverge if the share of points on planes falls below both: a share of all points, and a ratio to the share
+# in the first round.
+MIN_LAST_SHARE, MIN_RELATIVE_SHARE = 0.2, 0.7
+
+
+def state_from_lidar(inputs: Inputs) -> State:
+    """The initial state from the first LiDAR and the IMU. The extrinsics come from the recording with most points.
+
+    Raises EstimationError if a recording does not determine the trajectory.
+    """
+
+    def state_of(recording: Inputs, extrinsics: KnownExtrinsics | None) -> State:
+        with explaining_degeneracy(recording.measurements.lidars[:1]):
+            return _single_state(recording, extrinsics)
+
+    first = inputs.rig.lidars[0]
+    return states_from_best(inputs, first, fullest_recording(inputs, first.name), state_of)
+
+
+def _single_state(inputs: Inputs, extrinsics: KnownExtrinsics | None = None) -> State:
+    """The initial state of one recording. extrinsics: those known of the LiDAR from another recording."""
+    assert inputs.imu is not None
+    lidar, stream = inputs.rig.lidars[0], inputs.measurements.lidars[0]
+    try:
+        guess, motion = lidar_and_motion(
+            inputs.imu, stream, inputs.rig.gravity, extrinsics or known_extrinsics(inputs, lidar)
+        )
+    except EstimationError:
+        known = known_extrinsics(inputs, lidar, guesses=True)
+        if extrinsics is not None or known.rotation is None or known.offset is None:
+            raise
+        # The motion is insufficient: the initial guess of the rig file is used as known extrinsics.
+        guess, motion = lidar_and_motion(inputs.imu, stream, inputs.rig.gravity, known)
+    # Rotation and offset from angular rates are more accurate than a guess, which would make planes too thick to
+    # detect.
+    names = ("translation", *known_names(lidar)) if guess.rotation_observable else MOUNTED_NAMES
+    estimated, known = guess.values(lidar.name), stated_values(inputs, lidar, names)
+    initial = merged_values(lidar, known, estimated) if guess.rotation_observable else estimated | known
+    values = start_values(inputs, initial)
+    hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
+    keyframes = keyframes_for(inputs, keyframe_times(inputs, hosts)[:1])
+    rotation, position, velocity = motion.at(keyframes)
+    return State(keyframes, rotation, position, velocity, np.tile(motion.bias, (len(keyframes), 1)), values)
+
+
+def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
+    """Inputs with points associated with planes, and the state with planes after the rounds. `state` has the trajectory
+    and initial values of all parameters. Raises EstimationError if there are no planes."""
+    inputs = with_known_motion(inputs, state)
+    recordings = points_by_recording(inputs)
+    if any((s.plane >= 0).any() for streams in recordings for s in streams):
+        association = joined_associations([association_of_streams(streams) for streams in recordings])
+        return with_association(inputs, association), replace(
+            state, values=state.values | fitted_planes(inputs, state, association)
+        )
+    with explaining_degeneracy(inputs.measurements.lidars):
+        return _after_rounds(inputs, state, recordings)
+
+
+def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
+    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points."""
+    step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars))
+    fewer = _thinned_inputs(inputs, step)
+    associations: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
+    shares = []
+    for k in range(ASSOCIATION_ROUNDS - 1):
+        fewer, state, associations = _associated(fewer, state, k, associations)
+        shares.append(_share_on_planes(fewer.association))
+        state = first_pass(fewer, state)
+    before = [
+        _unthinned(a, streams, first, step)
+        for a, streams, first in zip(associations, recordings, _first_points(recordings), strict=True)
+    ]
+    inputs, state, _ = _associated(inputs, state, ASSOCIATION_ROUNDS - 1, before)
+    check_shares(
+        [*shares, _share_on_planes(inputs.association)], " and ".join(s.name for s in inputs.measurements.lidars)
+    )
+    return inputs, state
+
+
+def _associated(
+    inputs: Inputs, state: State, k: int, before: Sequence[AssociatedPlanes | None]
+) -> tuple[Inputs, State, list[AssociatedPlanes]]:
+    """Association of round k at `state`, without a solve. Returns inputs, state with planes, and the association of
+    each recording. before: associations of the previous round, None in the first."""
+    noise = max(x.range_noise_m or FIRST_RANGE_SIGMA_M for x in inputs.rig.lidars)
+    associations = []
+    for r, streams in enumerate(points_by_recording(inputs)):
+        with naming_recording(inputs, r):
+            associations.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
+    association = joined_associations([a.association for a in associations])
+    planes = np.concatenate([a.planes for a in associations])
+    values = _without_planes(state) | dict(zip(association.keys, planes, strict=True))
+    return with_association(inputs, association), replace(state, values=values), associations
+
+
+def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
+    """The inputs with every `step`th point. More points than the plane search uses do not improve early rounds."""
+    streams = inputs.measurements.lidars
+    fewer = [s.some(np.arange(len(s.xyz)) % step == 0) for s in streams]
+    return replace(inputs, measurements=inputs.measurements.with_streams(*fewer))
+
+
+def _first_points(recordings: Sequence[tuple[LidarStream, ...]]) -> np.ndarray:
+    """(R, L) index of the first point of each recording among all points of each LiDAR."""
+    sizes = np.array([[len(s.xyz) for s in streams] for streams in recordings])
+    return np.cumsum(sizes, axis=0) - sizes
+
+
+def _unthinned(
+    associated: AssociatedPlanes | None, streams: tuple[LidarStream, ...], first: np.ndarray, step: int
+) -> AssociatedPlanes | None:
+    """`associated`, of points thinned by `step`, expanded to all points of a recording; points that were left
+    out get no plane. first (L,): see `_first_points`."""
+    if associated is None:
+        return None
+    planes = tuple(np.full(len(s.xyz), -1, np.int32) for s in streams)
+    for plane, plane_of_thinned, n in zip(planes, associated.association.plane, first, strict=True):
+        plane[-n % step :: step] = plane_of_thinned
+    return replace(associated, association=replace(associated.association, plane=planes))
+
+
+def _share_on_planes(association: PlaneAssociation) -> float:
+    """Share of the points that lie on planes."""
+    return float(association.points.sum() / max(sum(len(p) for p in association.plane), 1))
+
+
+def check_shares(shares: Sequence[float], names: str) -> None:
+    """Raises EstimationError if the rounds diverge. shares: share of points on planes after each round; names:
+    LiDARs."""
+    first, last = shares[0], shares[-1]
+    if last < MIN_LAST_SHARE and last < MIN_RELATIVE_SHARE * first:
+        raise EstimationError(
+            f"fewer and fewer points of {names} lie on planes ({first:.0%}, then {last:.0%}), so the initial "
+            "guess is too far off; correct rotation, translation and time_offset in the rig file, or remove "
+            "them so that they are estimated."
+        )
+
+
+def _without_planes(state: State) -> dict[Key, np.ndarray]:
+    """Values of the state without those of planes."""
+    return {key: value for key, value in state.values.items() if key[1] != "plane"}
+
+
+def with_known_motion(inputs: Inputs, state: State) -> Inputs:
+    """Inputs without points that are not finite, and without scans far from the keyframes of `state`.
+
+    The model does not include the errors of poses propagated so far. Raises EstimationError if no scan is left.
+    """
+    measured, lidars, notes = inputs.measurements, [], list(inputs.measurements.notes)
+    for stream in measured.lidars:
+        begin = instants(stream, state.values)
+        last, some = np.zeros(len(begin)), np.diff(stream.start) > 0
+        last[some] = np.maximum.reduceat(stream.offset_s, stream.start[:-1][some]) if some.any() else 0.0
+        known = are_near_keyframes(state.seconds, begin) & are_near_keyframes(state.seconds, begin + last)
+        if not known.any():
+            raise EstimationError(
+                f"{stream.name}: none of its scans falls within the recording of the other sensors; check that the "
+                "clocks overlap, or the time_offset in the rig file."
+            )
+        if not known.all():
+            notes.append(
+                f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are ignored, because no "
+                "other sensor determines the motion at that time."
+            )
+        lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & are_somewhere(stream.xyz)))
+    return replace(inputs, measurements=replace(measured.with_streams(*lidars), notes=tuple(notes)))
+
+
+def lidar_values(inputs: Inputs, state: State) -> dict[Key, np.ndarray]:
+    """Initial extrinsics and time offsets of all LiDARs, given the trajectory in `state`.
+
+    A LiDAR without values in `state` gets those of the rig file, or else those from its scans. For a LiDAR with values
+    in `state`, only the known values of the rig file are returned. Raises EstimationError if a recording does not
+    determine them.
+    """
+    out: dict[Key, np.ndarray] = {}
+    for i, lidar in enumerate(inputs.rig.lidars):
+        if (lidar.name, "rotation") in state.values:
+            out |= stated_values(inputs, lidar, known_names(lidar))
+            continue
+        known = stated_values(inputs, lidar)
+        if len(known) < len(MOUNTED_NAMES):
+            k = fullest_recording(inputs, inputs.rig.lidars[i].name)
+            recording, motion = single_recording(inputs, k), state_of_recording(inputs, k, state)
+            assert recording.imu is not None
+            stream = recording.measurements.lidars[i]
+            with naming_recording(inputs, k), explaining_degeneracy([stream]):
+                guess = lidar_on_motion(recording.imu, stream, motion, known_extrinsics(recording, lidar))
+            offsets = np.array([converted_offset(guess.offset, lidar.name, recording, inputs)])
+            if lidar.clock_restarts:
+                extrinsics = KnownExtrinsics(guess.rotation, guess.position)
+                others = partial(_offset_on_motion, inputs, state, i, extrinsics)
+                offsets = offset_of_each_clock(inputs, lidar.name, others, {k: guess.offset})
+            known = guess.values(lidar.name) | {(lidar.name, "time_offset"): offsets} | known
+        out |= known
+    return out
+
+
+def _offset_on_motion(inputs: Inputs, state: State, lidar: int, extrinsics: KnownExtrinsics, recording: int) -> float:
+    """Time offset [s] of the LiDAR with index `lidar` in one recording, relative to the first stamps of that recording;
+    extrinsics: those known."""
+    single, motion = single_recording(inputs, recording), state_of_recording(inputs, recording, state)
+    assert single.imu is not None
+    stream = single.measurements.lidars[lidar]
+    with explaining_degeneracy([stream]):
+        return lidar_on_motion(single.imu, stream, motion, extrinsics).offset
+
+
+def fitted_planes(inputs: Inputs, state: State, association: PlaneAssociation) -> dict[Key, np.ndarray]:
+    """Planes fitted to points with known planes at `state` (total least squares), as values of a state. Very large
+    clouds are thinned."""
+    motion, sums = motion_of(inputs, state), np.zeros((association.count, 4, 4))
+    for stream, plane in zip(inputs.measurements.lidars, association.plane, strict=True):
+        if (plane >= 0).any():
+            some = AssociatedPoints(stream, thinned(plane), np.zeros((association.count, 6)))
+            moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
+            _add_in_world(moments, motion, stream, sums)
+    out = {}
+    for key, M in zip(association.keys, sums, strict=True):
+        centre = M[1:, 0] / M[0, 0]
+        spread = M[1:, 1:] / M[0, 0] - np.outer(centre, centre)
+        out[key] = plane_of(np.linalg.eigh(spread)[1][:, 0], centre)
+    return out
+
+
+def _add_in_world(moments: Moments, motion: EstimatedMotion, stream: LidarStream, sums: np.ndarray) -> None:
+    """Adds the sums of (1, x) (1, x)^T over the points x of each plane, in the world, to sums (P, 4, 4)."""
+    at = sweep(motion, stream.name, instants(stream, motion.state.values, moments.seconds))
+    bin_of = np.repeat(np.arange(len(moments.seconds)), np.diff(moments.start))
+    L, A = np.zeros((len(bin_of), 4, 4)), np.zeros((len(bin_of), 4, 4))
+    L[:, *np.tril_indices(4)] = moments.root
+    A[:, 0, 0], A[:, 1:, 0], A[:, 1:, 1:] = 1.0, at.position[bin_of], at.rotation[bin_of]
+    X = A @ L
+    np.add.at(sums, moments.plane, X @ X.transpose(0, 2, 1))
+
+
+def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
+    """For each recording, the streams of all LiDARs on the joined clock with the points of this recording. Scans of
+    other recordings stay as empty scans."""
+    streams = inputs.measurements.lidars
+    if len(inputs.parts) == 1:
+        return [streams]
+    scans = [[len(part.measurements.lidars[i].stamps_ns) for part in inputs.parts] for i in range(len(streams))]
+    recording_of_scan = [np.repeat(np.arange(len(n)), n) for n in scans]
+    return [
+        tuple(s.some(np.repeat(o == r, np.diff(s.start))) for s, o in zip(streams, recording_of_scan, strict=True))
+        for r in range(len(inputs.parts))
+    ]
+
 
 POINTS_PER_PART = 200_000  # points of a thread at a time; bounds the memory
 ASSOCIATION_ROUNDS = 4

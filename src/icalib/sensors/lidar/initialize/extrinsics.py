@@ -17,7 +17,6 @@ from icalib.initialize.steps.rate_alignment import RateAlignment, only_axis
 from icalib.initialize.steps.rate_correlation import SensorRates
 from icalib.initialize.steps.single_recording import NOTHING_KNOWN, KnownExtrinsics
 from icalib.initialize.trajectories.imu_trajectory import MAX_PROPAGATION_S, ImuTrajectory
-from icalib.initialize.trajectories.known_trajectory import imu_poses_at
 from icalib.initialize.trajectories.lever_arm_rows import (
     DISPLACEMENT_SIGMA_M,
     MIN_MIRRORED_SHARE,
@@ -27,9 +26,14 @@ from icalib.initialize.trajectories.lever_arm_rows import (
     solve_lever_arm,
     system_from_trajectory,
 )
-from icalib.initialize.trajectories.rotation_alignment import align_trajectory
-from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, SensorTrajectory
-from icalib.initialize.trajectories.trajectory_fit import TRAJECTORY_GRAVITY_TOLERANCE, fit_imu_trajectory
+from icalib.initialize.trajectories.trajectory_fit import (
+    TRAJECTORY_GRAVITY_TOLERANCE,
+    ExtrinsicsGuess,
+    SensorTrajectory,
+    align_trajectory,
+    fit_imu_trajectory,
+    imu_poses_at,
+)
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.sensors.lidar.initialize.odometry import Scan, lidar_trajectory, sampled_scans

@@ -15,7 +15,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.trajectories.sensor_trajectory import SensorTrajectory
+from icalib.initialize.trajectories.trajectory_fit import SensorTrajectory
 from icalib.sensors.lidar.initialize.odometry import MAX_MAPPED_POINTS, lidar_trajectory, sampled_scans
 
 ROBOT_RADIUS_M = 2.5  # the robot is assumed not to extend further from its LiDAR

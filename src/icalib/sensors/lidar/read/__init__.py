@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.data.recordings.base import Reading, ReadStream, Recording
-from icalib.data.tables.files import TableFile
+from icalib.data.tables.table import TableFile
 from icalib.data.topics import MessageType, UnreadType
 from icalib.sensors.lidar.read import livox
 from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.data.messages.streams import HasMessages
+from icalib.data.messages import HasMessages
 from icalib.errors import RecordingError
 from icalib.rig import Lidar, TimeUnit
 from icalib.sensors.lidar.read.azimuth_times import SweepOrder, find_sweep, sweep_share

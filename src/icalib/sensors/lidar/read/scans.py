@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.unpacking import load_arrays
-from icalib.data.images.unreadable import HEAD_BYTES, not_data
+from icalib.base.input_files import HEAD_BYTES, load_arrays, not_data
 from icalib.data.measurements import LidarStream
 from icalib.errors import RecordingError
 from icalib.rig import Lidar

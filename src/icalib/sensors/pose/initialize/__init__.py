@@ -11,8 +11,7 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.initializer import BY_POSES, Initializer, InputsWithMotion, Values
-from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.initializer import BY_POSES, Initializer, InputsWithMotion, SmoothMotion, Values
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.optim.state import State

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import PoseStream
-from icalib.data.tables.axes import in_axes
+from icalib.data.tables.columns import in_axes
 from icalib.errors import EstimationError
 from icalib.rig import Axes
 from icalib.sensors.pose.initialize.position_frame import axes_text

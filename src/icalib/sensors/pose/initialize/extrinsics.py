@@ -18,12 +18,11 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
-from icalib.initialize.steps.contradicted_guesses import has_guesses, merged_values
+from icalib.initialize.steps.contradicted_guesses import has_guesses, known_extrinsics, merged_values, stated_values
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.lever_arm import TARGET_SIZE_TOLERANCE, scale_by_accelerometer
 from icalib.initialize.steps.rate_alignment import RateAlignment
 from icalib.initialize.steps.rate_correlation import SensorRates
-from icalib.initialize.steps.rig_file_values import known_extrinsics, stated_values
 from icalib.initialize.steps.single_recording import (
     KnownExtrinsics,
     fullest_recording,
@@ -33,19 +32,18 @@ from icalib.initialize.steps.single_recording import (
     state_of_recording,
     states_from_best,
 )
-from icalib.initialize.trajectories.known_trajectory import (
+from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows, system_from_readings, system_from_trajectory
+from icalib.initialize.trajectories.trajectory_fit import (
+    TRAJECTORY_GRAVITY_TOLERANCE,
+    ExtrinsicsGuess,
+    SensorTrajectory,
+    TrajectoryFit,
+    align_trajectory,
     extrinsics_on_trajectory,
+    fit_imu_trajectory,
     imu_poses_at,
     too_few_poses,
     trajectory_rates,
-)
-from icalib.initialize.trajectories.lever_arm_rows import LeverArmRows, system_from_readings, system_from_trajectory
-from icalib.initialize.trajectories.rotation_alignment import align_trajectory
-from icalib.initialize.trajectories.sensor_trajectory import ExtrinsicsGuess, SensorTrajectory
-from icalib.initialize.trajectories.trajectory_fit import (
-    TRAJECTORY_GRAVITY_TOLERANCE,
-    TrajectoryFit,
-    fit_imu_trajectory,
 )
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.imu_data import ImuData

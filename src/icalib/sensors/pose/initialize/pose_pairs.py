@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.checks.stops import moved
+from icalib.data.checks import moved
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.motion.keyframe_placement import MERGED_WITHIN_S
 

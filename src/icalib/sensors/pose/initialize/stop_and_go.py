@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.checks.stops import stands_still_between
+from icalib.data.checks import stands_still_between
 from icalib.data.measurements import Measurements, PoseStream
-from icalib.data.recordings.several import naming
+from icalib.data.recordings.opening import naming
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
+from icalib.initialize.steps.contradicted_guesses import stated_values
 from icalib.initialize.steps.hand_eye import (
     MAX_UNEXPLAINED_MOTION,
     HandEye,
@@ -29,7 +30,6 @@ from icalib.initialize.steps.hand_eye import (
     relative_motions,
     unexplained_motion,
 )
-from icalib.initialize.steps.rig_file_values import stated_values
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.motion.pose_rows import Extrinsics

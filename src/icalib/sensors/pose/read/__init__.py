@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.messages.streams import read_odometry, read_poses
+from icalib.data.messages import read_odometry, read_poses
 from icalib.data.recordings.base import Reading, ReadStream, Recording
-from icalib.data.tables.files import TableFile
-from icalib.data.tables.table import holds
+from icalib.data.tables.table import TableFile, holds
 from icalib.data.topics import MessageType, TopicInfo
 from icalib.errors import RecordingError
 from icalib.sensors.pose.read.checks import checked_poses

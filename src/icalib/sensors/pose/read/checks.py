@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.data.checks.stops import stands_still_between
+from icalib.data.checks import stands_still_between
 from icalib.data.measurements import PoseStream
 from icalib.data.stamps.ordered import kept_readings
 from icalib.errors import RecordingError

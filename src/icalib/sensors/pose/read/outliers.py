@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from icalib.geometry import so3
-from icalib.geometry.cubic import lagrange_weights
+from icalib.geometry.vectors import lagrange_weights
 
 _OUTLIER_MEDIANS = 6.0  # in median distances: about 9 standard deviations, which noise does not reach
 _MEDIAN_WINDOW = 51  # window in poses, as motion and noise change over a recording

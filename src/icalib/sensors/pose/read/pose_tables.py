@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from icalib.data.images.image_checks import Note, ignore
-from icalib.data.messages.streams import unit_rotations
-from icalib.data.tables.axes import in_axes
-from icalib.data.tables.columns import STAMP, TableKind, split_kind, vector_names
+from icalib.data.messages import unit_rotations
+from icalib.data.tables.columns import STAMP, TableKind, in_axes, split_kind, vector_names
 from icalib.data.tables.table import read_table
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, PoseSensor, TableLayout

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from icalib.data.images.image_checks import Note
-from icalib.data.messages.streams import HasMessages, unit_rotations
+from icalib.data.messages import HasMessages, unit_rotations
 from icalib.data.topics import TopicInfo, find_topic
 from icalib.errors import RecordingError
 from icalib.geometry import so3

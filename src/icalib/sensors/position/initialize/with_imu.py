@@ -17,17 +17,20 @@ from icalib.initialize.steps.lever_arm import Triples
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.position.initialize.attitude import (
+    MIN_JERK_CORRELATION,
     MIN_WINDOW_TRIPLES,
+    SIGNAL_RATE_HZ,
     Fix,
+    IntegratedReadings,
     WindowFit,
     WindowPrior,
     WindowUnknowns,
     first_attitude,
     fit_window,
+    likely_offsets,
+    recorded,
     sigmas,
 )
-from icalib.sensors.position.initialize.clock import MIN_JERK_CORRELATION, SIGNAL_RATE_HZ, likely_offsets
-from icalib.sensors.position.initialize.triples import IntegratedReadings, recorded
 
 FIRST_HALF_WINDOW_S = 10.0  # a gyroscope bias of 0.5 deg/s turns 5 degrees in it, which Kabsch tolerates
 MAX_HALF_WINDOW_S = 60.0  # of the largest window: biases are modelled as constant in it

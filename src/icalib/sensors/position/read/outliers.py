@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-from icalib.geometry.cubic import lagrange_weights
+from icalib.geometry.vectors import lagrange_weights
 
 MEDIAN_WINDOW_FIXES = 51  # of the moving median of distances, as motion and noise change
 MAX_MEDIAN_DISTANCES = 8.0  # an outlier is this many median distances off, some 10 standard deviations

@@ -1,14 +1,24 @@
-"""Fixes as recorded, and as positions in metres relative to the first good one."""
+"""Fixes as recorded, and as positions in metres relative to the first good one.
+
+Positions in messages of a bag: NavSatFix, PointStamped, poses and Odometry. Tables of positions: metric x, y, z, or
+latitude, longitude and height; with standard deviations where a header names them.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.tables.columns import STAMP, TableKind, places_by_name
+from icalib.data.tables.table import named, read_table
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import earth_centred, local_metres
-from icalib.sensors.position.spec import STATUSES, Status
+from icalib.sensors.position.spec import STATUSES, PositionSensor, Status
 from icalib.sensors.stream import RawReadings
 
 NO_COVARIANCE = np.zeros((0, 3, 3))
@@ -129,3 +139,115 @@ def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings
     x, y, z = origin
     note = f"{what}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away."
     return replace(readings, position=p - origin, frame=readings.frame.moved(origin)), (note,)
+
+
+# NavSatStatus: -1 no fix, 0 fix, 1 satellite-based, 2 ground-based augmentation (where receivers report RTK).
+_NAVSAT_STATUS = {0: STATUSES.index("single"), 1: STATUSES.index("differential"), 2: STATUSES.index("fixed")}
+COVARIANCE_UNKNOWN = 0
+
+
+def from_navsat(name: str, stamped: Iterable[tuple[int, Any]]) -> tuple[PositionReadings, np.ndarray]:
+    """Readings of sensor_msgs/NavSatFix, not yet in metres; and latitude, longitude [deg], height [m] (N, 3)."""
+    messages = list(stamped)
+    stamps_ns = np.array([stamp for stamp, _ in messages], np.int64)
+    degrees = np.array([(m.latitude, m.longitude, m.altitude) for _, m in messages]).reshape(-1, 3)
+    status = np.array([_NAVSAT_STATUS.get(int(m.status.status), -1) for _, m in messages], np.int64)
+    covariance = np.array([np.asarray(m.position_covariance, float).reshape(3, 3) for _, m in messages]).reshape(
+        -1, 3, 3
+    )
+    known = np.array([int(m.position_covariance_type) != COVARIANCE_UNKNOWN for _, m in messages], bool)
+    fixed = (status >= 0) & np.isfinite(degrees).all(axis=1)
+    return PositionReadings(name, stamps_ns, degrees, _usable(covariance, known, fixed), status), degrees
+
+
+def from_positions(name: str, messages: Iterable[tuple[int, Any]]) -> PositionReadings:
+    """Readings of PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry."""
+    stamps, positions, covariances = [], [], []
+    for stamp, message in messages:
+        stamps.append(stamp)
+        point, covariance = _point(message)
+        positions.append((point.x, point.y, point.z))
+        covariances.append(
+            np.zeros((3, 3)) if covariance is None else np.asarray(covariance, float).reshape(6, 6)[:3, :3]
+        )
+    position, covariance = np.array(positions).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
+    everything = np.ones(len(stamps), bool)
+    usable = _usable(covariance, everything, everything)
+    return PositionReadings(name, np.array(stamps, np.int64), position, usable, np.zeros(0, np.int64))
+
+
+def _point(message: Any) -> tuple[Any, Any]:
+    """The position of a message, and its covariance (36,) where it has one."""
+    if hasattr(message, "point"):
+        return message.point, None
+    if hasattr(message, "transform"):
+        return message.transform.translation, None
+    if hasattr(message.pose, "pose"):
+        return message.pose.pose.position, message.pose.covariance
+    return message.pose.position, None
+
+
+def _usable(covariance: np.ndarray, known: np.ndarray, needed: np.ndarray) -> np.ndarray:
+    """The covariances (N, 3, 3), or NO_COVARIANCE unless all that are `needed` (N,) are known and positive definite."""
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    good = known & (np.linalg.eigvalsh(finite)[:, 0] > 0.0) if len(finite) else known
+    if not needed.any() or not good[needed].all():
+        return NO_COVARIANCE
+    return np.where(needed[:, None, None], finite, np.eye(3))
+
+
+FIX_RATES_HZ = (1e-2, 1000.0)  # lowest and highest: other rates show another unit of the stamps
+_SIGMA = r"(s|sd|std|stddev|sigma|std_dev)"
+METRIC = TableKind(
+    ("t [ns]",),
+    ("x [m]", "y [m]", "z [m]"),
+    (
+        STAMP,
+        (r"(p|pos|position|point|p_rs_r)_?x|x|east(ing)?|e",),
+        (r"(p|pos|position|point|p_rs_r)_?y|y|north(ing)?|n",),
+        (r"(p|pos|position|point|p_rs_r)_?z|z|up|u|height|h|altitude|alt",),
+    ),
+    FIX_RATES_HZ,
+)
+GEODETIC = TableKind(
+    ("t [ns]",),
+    ("latitude [deg]", "longitude [deg]", "height [m]"),
+    (
+        STAMP,
+        (r"lat(itude)?(_deg)?",),
+        (r"lon(g|gitude)?(_deg)?",),
+        (r"(ellipsoid(al)?_)?h(eight)?(_m)?|alt(itude)?(_m)?|hgt|hae",),
+    ),
+    FIX_RATES_HZ,
+)
+_DEVIATIONS = (
+    (rf"{_SIGMA}_?(x|e|east)",),
+    (rf"{_SIGMA}_?(y|n|north)",),
+    (rf"{_SIGMA}_?(z|u|up|h)",),
+)
+
+
+def read_position_table(sensor: PositionSensor, path: Path, note: Note = ignore) -> tuple[PositionReadings, bool]:
+    """The positions in a table, and whether they are latitude, longitude and height: as the rig file says, or as the
+    names of the columns do. Standard deviations are those of east, north and up, or of x, y and z. Raises
+    RecordingError naming file and line."""
+    layout, geodetic = sensor.layout, sensor.coordinates == "geodetic"
+    if sensor.coordinates is None:
+        geodetic = named(path, GEODETIC) if not layout.columns else places_by_name(GEODETIC, layout.columns) is not None
+    kind = GEODETIC if geodetic else METRIC
+    stated = _with_deviations(kind)
+    kind = stated if len(layout.columns) == len(stated.names) or (not layout.columns and named(path, stated)) else kind
+    table = read_table(path, kind, layout, note)
+    values = table.decimals
+    covariance = NO_COVARIANCE
+    if values.shape[1] == 6 and (values[:, 3:] > 0.0).all():
+        covariance = values[:, 3:, None] ** 2 * np.eye(3)
+    readings = PositionReadings(
+        sensor.name, table.integers[:, 0].copy(), values[:, :3].copy(), covariance, np.zeros(0, np.int64)
+    )
+    return readings, geodetic
+
+
+def _with_deviations(kind: TableKind) -> TableKind:
+    return replace(kind, decimals=(*kind.decimals, "sx [m]", "sy [m]", "sz [m]"), known=(*kind.known, *_DEVIATIONS))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.file_hashes import hash_of
+from icalib.base.input_files import hash_of
 from icalib.errors import RecordingError
 from icalib.sensors.position.spec import STATUSES
 
@@ -80,7 +80,7 @@ def read_pos(path: Path) -> PosFile:
 
 
 def _unpacked(path: Path, content: bytes) -> bytes:
-    from icalib.base.unpacking import gunzipped  # noqa: PLC0415
+    from icalib.base.input_files import gunzipped  # noqa: PLC0415
 
     try:
         return gunzipped(content)

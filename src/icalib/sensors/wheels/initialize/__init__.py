@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from icalib.data.measurements import Measurements
 from icalib.estimate.problem.inputs import Inputs
-from icalib.initialize.steps.initializer import BY_DEAD_RECKONING, Initializer, Values, kinds_of
-from icalib.initialize.steps.keyframe_spacing import SmoothMotion
+from icalib.initialize.steps.initializer import BY_DEAD_RECKONING, Initializer, SmoothMotion, Values, kinds_of
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Rig, Wheels

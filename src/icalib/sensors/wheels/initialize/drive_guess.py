@@ -18,9 +18,8 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
-from icalib.initialize.steps.cross_correlation import best_shift
-from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, correlation_in_words, max_rate_step
-from icalib.initialize.steps.rate_windows import pairs_within
+from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, best_shift, correlation_in_words, max_rate_step
+from icalib.initialize.steps.smooth_trajectory import pairs_within
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.pose_rows import Extrinsics
 from icalib.motion.stamp_intervals import MAX_INTERVAL_S

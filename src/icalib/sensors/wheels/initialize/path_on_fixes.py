@@ -20,8 +20,8 @@ import numpy as np
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.initialize.steps.contradicted_guesses import merged_values
-from icalib.initialize.steps.cross_correlation import MaskedSignal, best_shifts
 from icalib.initialize.steps.initializer import Fixes, Values
+from icalib.initialize.steps.rate_correlation import MaskedSignal, best_shifts
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
 from icalib.sensors.wheels.initialize.planar_path import PlanarSteps, planar_poses, planar_steps, with_sizes

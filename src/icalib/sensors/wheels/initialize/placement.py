@@ -17,10 +17,10 @@ from icalib.initialize.steps.contradicted_guesses import (
     is_contradicted,
     merged_values,
     refuse_far_off,
+    stated_values,
 )
-from icalib.initialize.steps.rig_file_values import stated_values
+from icalib.initialize.steps.initializer import possible_verticals
 from icalib.initialize.steps.single_recording import offset_of_each_clock, single_recording
-from icalib.initialize.steps.vertical import possible_verticals
 from icalib.motion.imu_data import clear_of
 from icalib.motion.known_motion import imu_poses, is_known
 from icalib.motion.time_offsets import instants

@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.messages.streams import read_odometry_twists, read_twists
+from icalib.data.messages import read_odometry_twists, read_twists
 from icalib.data.recordings.base import Reading, ReadStream, Recording
-from icalib.data.tables.files import TableFile
-from icalib.data.tables.table import holds, read_table
+from icalib.data.tables.table import TableFile, holds, read_table
 from icalib.data.topics import MessageType, TopicInfo
 from icalib.sensors.sensor import TableLayout
 from icalib.sensors.wheels.read.checks import checked_wheels

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.data.images.image_checks import Note
 from icalib.data.measurements import WheelPoses
-from icalib.data.messages.streams import TwistStream
+from icalib.data.messages import TwistStream
 from icalib.data.tables.columns import STAMP, TableKind
 from icalib.data.tables.table import Table, read_table
 from icalib.errors import RecordingError

@@ -9,7 +9,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 import numpy as np
 
-from icalib.base.file_names import NAME, NAME_WORDS
+from icalib.base.files import NAME, NAME_WORDS
 from icalib.base.yaml_nodes import LARGEST_INTEGER, YamlValue, read_yaml
 from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS

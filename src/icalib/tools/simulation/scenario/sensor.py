@@ -17,7 +17,7 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
-from icalib.tools.simulation.output.bag_writer import BagWriter
+from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.scenario.robot import Drive
 from icalib.tools.simulation.scenario.room import Room
 from icalib.tools.simulation.scenario.trajectory import TrueTrajectory

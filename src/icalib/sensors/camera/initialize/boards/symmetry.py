@@ -24,10 +24,9 @@ from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.connected_bodies import taken_at_once
-from icalib.sensors.camera.initialize.align_camera import align_camera
 from icalib.sensors.camera.initialize.boards.intrinsics import camera_params
 from icalib.sensors.camera.initialize.boards.target_poses import FlatPoints, TargetPoses, camera_rates, target_poses
-from icalib.sensors.camera.initialize.guess import relative_offset
+from icalib.sensors.camera.initialize.guess import align_camera, relative_offset
 
 # Largest number of pairs of simultaneous images that determine the relative rotation of two cameras. The cost grows
 # with its square, and the rotation only has to distinguish symmetries.

@@ -14,7 +14,7 @@ from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.small import solve_definite
 from icalib.initialize.steps.rate_correlation import SensorRates, max_rate_step
-from icalib.initialize.steps.rate_windows import pairs_within
+from icalib.initialize.steps.smooth_trajectory import pairs_within
 
 MAX_POSE_CORNERS = 48  # corners of an image that are used, at most; bounds the time
 MIN_POSE_CORNERS = 6  # corners of a board that give a pose; fewer may be nearly collinear

@@ -10,8 +10,8 @@ import numpy as np
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
+from icalib.initialize.steps.contradicted_guesses import known_value, stated_values
 from icalib.initialize.steps.rate_alignment import main_axis, rough_alignments
-from icalib.initialize.steps.rig_file_values import known_value, stated_values
 from icalib.initialize.steps.single_recording import (
     converted_offset,
     fullest_recording,
@@ -30,7 +30,7 @@ from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import (
     extrinsics_on_motion,
 )
 from icalib.sensors.camera.initialize.tracks.from_tracks import start_intrinsics
-from icalib.sensors.camera.initialize.tracks.track_rates import matching_track_rates
+from icalib.sensors.camera.initialize.tracks.joint_alignment import matching_track_rates
 from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 

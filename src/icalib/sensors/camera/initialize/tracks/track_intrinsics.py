@@ -28,17 +28,15 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
-from icalib.initialize.steps.gyro_rates import MeanRates
 from icalib.initialize.steps.gyro_rotation import GyroRotation
 from icalib.initialize.steps.rate_alignment import RateAlignment, covered, kabsch, no_overlap
 from icalib.initialize.steps.rate_correlation import SensorRates
-from icalib.initialize.steps.rate_regression import best_regressions
+from icalib.initialize.steps.rate_regression import MeanRates, best_regressions
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.tracks.epipolar_extrinsics import ImagePairs, ray_derivatives
 from icalib.sensors.camera.initialize.tracks.epipolar_rotation import rotation_information_of_pairs
-from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_rotations
-from icalib.sensors.camera.initialize.tracks.track_rates import matching_track_rates, track_rates
+from icalib.sensors.camera.initialize.tracks.joint_alignment import gyro_rotations, matching_track_rates, track_rates
 
 FREE_MODEL = "pinhole-equidistant"  # r = f theta plus a polynomial; zero distortion is close to narrow and wide lenses
 START_FOCAL_WIDTHS = (1.0, 0.35)  # start focal lengths in image widths: of a usual lens, and of a fisheye lens

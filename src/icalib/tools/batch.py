@@ -1,15 +1,31 @@
-"""Tasks on many cores or machines, by Dask. If a worker dies, its task is repeated on another worker."""
+"""Many independent tasks on local processes or a Dask cluster; finished tasks are stored, so that a rerun resumes.
+
+If a worker dies, its task is repeated on another worker.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Generator, Iterable
 from contextlib import ExitStack
-from dataclasses import dataclass
-from typing import Any, TypeVar
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from icalib.base.extras import load_dask, load_distributed
 from icalib.errors import CalibrationError
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+import hashlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+
+from icalib.base.extras import load_filelock
+from icalib.base.files import staged, writing
 
 ANSWER_WITHIN_S = 10  # time limit to connect to a scheduler
 # No task is queued at a busy worker: Dask would count the worker's death against the queued task, too, and give it up.
@@ -104,3 +120,90 @@ def _answer(distributed: Any, future: Any) -> Any:
     return FailedTask(
         f"its worker failed to run it ({type(error).__name__}: {error}); install the same icalib everywhere."
     )
+
+
+def record_json(record: DataclassInstance, form: int) -> bytes:
+    """JSON of a dataclass of arrays and plain values, with all digits; form: number of the file format."""
+    return json.dumps({"format": form} | asdict(record), default=lambda array: array.tolist()).encode()
+
+
+def plain_record(text: bytes, form: int) -> dict[str, Any]:
+    """The fields of the dataclass that `record_json` wrote, as plain values. Raises ValueError, KeyError or TypeError
+    if `text` is not such a record of format `form`."""
+    plain: dict[str, Any] = json.loads(text)
+    if plain.pop("format") != form:
+        raise ValueError("another format")
+    return plain
+
+
+def sentence_on(error: Exception) -> str:
+    """The message for the record of a failed task, which does not stop the others. An unexpected exception is reported
+    as a fault of icalib."""
+    if isinstance(error, CalibrationError):
+        return str(error)
+    return f"the program failed ({type(error).__name__}: {error}), which is a fault of icalib; please report it."
+
+
+def check_worker(worker_program: str, local_program: str) -> None:
+    """Raises CalibrationError if the digest of the worker's program differs from that on this machine."""
+    if worker_program != local_program:
+        raise CalibrationError(
+            "a worker of the cluster runs another version of icalib than this machine; install the same "
+            "version everywhere."
+        )
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Writes the file atomically: readers see the old content or the new one. Raises CalibrationError if it fails."""
+    with replacing(path) as part, part.open("wb") as file:
+        file.write(content)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Context with the path of a temporary file, which replaces `path` at the end, or is removed if anything fails.
+
+    Raises CalibrationError if the file cannot be written.
+    """
+    with writing(path), staged(path.parent) as place:
+        part = place / path.name
+        yield part
+        with part.open("r+b") as file:
+            os.fsync(file.fileno())
+        part.replace(path)
+
+
+LOCK = ".lock"
+
+
+@contextmanager
+def exclusive_lock(folder: Path) -> Iterator[None]:
+    """Context with an exclusive lock on `folder`. The lock ends with the process, however that ends.
+
+    Raises CalibrationError if another process has the lock, or the folder cannot be written. A file system without
+    locks is not protected.
+    """
+    filelock = load_filelock()
+    lock = filelock.FileLock(folder / LOCK)
+    with writing(folder), suppress(NotImplementedError):  # the file system has no locks
+        try:
+            lock.acquire(blocking=False)
+        except filelock.Timeout:
+            raise CalibrationError(
+                f"another icalib uses {folder}; wait until it ends, stop it, or choose another folder."
+            ) from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+@cache
+def program() -> str:
+    """Digest of the Python source of `icalib`, 16 hexadecimal digits. Results of different versions, released or
+    not, must not be mixed."""
+    digest = hashlib.sha256()
+    root = Path(__file__).parents[1]
+    for file in sorted(root.rglob("*.py")):
+        digest.update(file.relative_to(root).as_posix().encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
