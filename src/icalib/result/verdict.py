@@ -22,9 +22,8 @@ import numpy as np
 
 from icalib.motion.axes import hardly_turned
 from icalib.result.projection import projection_uncertainty
-from icalib.rig import Settings
+from icalib.rig import Settings, prior_words
 from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
-from icalib.sensors.imu.spec import prior_words
 from icalib.sensors.parameter_spec import display_unit
 
 if TYPE_CHECKING:
@@ -145,15 +144,15 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[str]:
     """Sentences on the components that have each of `verdicts`: first those whose standard deviation comes from the
     prior on IMU intrinsics, then all others but those that the sentence on an unobservable direction names."""
     for verdict in verdicts:
-        found = [(name, by_imu) for name, v, by_imu in _components(c) if v == verdict]
-        if names := [name for name, by_imu in found if by_imu]:
+        components = [(name, by_imu) for name, v, by_imu in _components(c) if v == verdict]
+        if names := [name for name, by_imu in components if by_imu]:
             prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
             yield (
                 f"{_listed(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
                 f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial`, `tactical`), or "
                 "`intrinsics: fixed` if it is calibrated."
             )
-        names = [name for name, by_imu in found if not by_imu]
+        names = [name for name, by_imu in components if not by_imu]
         if verdict == "unobservable":
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
