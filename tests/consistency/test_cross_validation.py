@@ -164,14 +164,13 @@ def _unstated(camera: Camera) -> Camera:
 
 
 def test_a_half_that_knows_planes_badly_is_no_alarm():
-    """A LiDAR on a vehicle on a flat floor, its planes found in the clouds. The solution of one half is so far from
-    the other that measured residuals rise by 3500 where noise makes them rise by 164 +- 37, and all errors are honest.
-    """
+    """A LiDAR on a vehicle on a flat floor, its planes found in the clouds. Measured residuals of the other half rise
+    by 175 where noise makes them rise by 167 +- 34, and all errors are honest."""
     scenario = make_robot("planar", 15.0, "l")
     simulation = simulate(scenario, 5)
     rig = with_drawn_guess(rig_for(scenario, settings=Settings()), scenario, 5)
     result = calibrate_measurements(rig, simulation.measurements.unassociated())
     record = compare(5, result, simulation.truth, [], 0.0)
     assert np.abs(record.error / np.sqrt(np.diag(record.covariance))).max() < 3.0
-    assert held(result).fits == () and not held(result).optimistic, held(result)
+    assert not held(result).optimistic, held(result)
     assert not any("predicts the other" in w for w in result.warnings)

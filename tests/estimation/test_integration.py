@@ -43,7 +43,8 @@ class Irregular:
         return r
 
     def readings(self):
-        return Readings(self.t, self.values, self.means, self.variance, self.walk)
+        gyro, accel = self.values[:, :3].copy(), self.values[:, 3:].copy()
+        return Readings(self.t, gyro, accel, self.means, self.variance, self.walk)
 
     def at(self, t):
         """Rate and force (6,) at t, those of the end beyond it."""
@@ -159,7 +160,8 @@ def wave_errors(rate_hz, sampling):
     stream = ImuStream("imu0", np.round(t * 1e9).astype(np.int64), x[:, :3].copy(), x[:, 3:].copy())
     r = Irregular()
     imu = ImuData.build(stream, ImuNoise(1e-4, 1e-5, 1e-3, 1e-4), sampling=sampling)
-    r.t, (r.values, r.means) = t, imu.signals
+    gyro, accel, r.means = imu.signals
+    r.t, r.values = t, np.hstack([gyro, accel])
     r.variance, gravity, errors = imu.variance, np.array([0.0, 0.0, -9.81]), []
     for t0 in np.arange(1.0013, 5.0, 0.3):
         for begin, end in ((t0, t0 + 0.05), (t0 + 0.05, t0)):

@@ -176,7 +176,8 @@ def test_shapes_without_what_is_not_wanted(setup):
 
 def parabola(imu, t):
     """Readings (n, 6) at t (n,): between stamps those of the parabola through both and of the signal's mean."""
-    values, means = imu.signals
+    gyro, accel, means = imu.signals
+    values = np.hstack([gyro, accel])
     j = imu.interval(t)
     u = ((t - imu.seconds[j]) / (imu.seconds[j + 1] - imu.seconds[j]))[:, None]
     bend = 6.0 * means[j] - 3.0 * (values[j] + values[j + 1])

@@ -75,26 +75,27 @@ class ImuData:
         return layout.columns(*self.unit) if layout.has(*self.unit) else np.full(1, -1)
 
     @cached_property
-    def signals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rates [rad/s] and specific forces [m/s^2]: values (N, 6) at the stamps, and means (N - 1, 6) of the intervals
-        between them. Each is that of a polynomial through CUBIC readings, one-sided at ends and gaps."""
+    def signals(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rates [rad/s] and specific forces [m/s^2] (N, 3) at the stamps, and means (N - 1, 6) of both over the
+        intervals between them. Each is that of a polynomial through CUBIC readings, one-sided at ends and gaps."""
         readings = np.hstack([self.gyro, self.accel])
         if self.sampling == "instantaneous":
-            return readings, self._means_of_samples(readings, CUBIC)
+            return self.gyro, self.accel, self._means_of_samples(readings, CUBIC)
         inside = ~self._is_gap
         means = np.where(inside[:, None], readings[1:], 0.5 * (readings[1:] + readings[:-1]))
         # Values in the middles of intervals: means without their second-order part.
         middles, k = means.copy(), 1 + np.flatnonzero(inside[:-2] & inside[1:-1] & inside[2:])
         middles[k] -= (means[k - 1] - 2.0 * means[k] + means[k + 1]) / 24.0
-        return self._values_between(readings, middles), means
+        values = self._values_between(readings, middles)
+        return values[:, :3].copy(), values[:, 3:].copy(), means
 
     def interpolation_error(self) -> np.ndarray:
         """(N - 1, 2) estimated RMS error of `signals` in the mean rate [rad/s] and force [m/s^2] of each interval: the
         difference to a polynomial through QUINTIC readings, averaged over the axes. Noise adds 4 % of its own size."""
         if self.sampling == "interval-mean":
             return np.zeros((len(self.seconds) - 1, 2))
-        values, means = self.signals
-        error = (self._means_of_samples(values, QUINTIC) - means) ** 2
+        gyro, accel, means = self.signals
+        error = (self._means_of_samples(np.hstack([gyro, accel]), QUINTIC) - means) ** 2
         return np.sqrt(error.reshape(-1, 2, 3).mean(axis=2))
 
     @cached_property

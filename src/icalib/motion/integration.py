@@ -43,11 +43,12 @@ from icalib.motion.integration_step import (
 
 
 class Readings(NamedTuple):
-    """t (N,) seconds on the IMU clock; values (N, 6): rates [rad/s] and specific forces [m/s^2] at the stamps; means
-    (N - 1, 6): of each interval; variance (N - 1, 3), walk (2,): see `ImuData`."""
+    """t (N,) seconds on the IMU clock; gyro, accel (N, 3): rates [rad/s] and specific forces [m/s^2] at the stamps;
+    means (N - 1, 6): of each interval; variance (N - 1, 3), walk (2,): see `ImuData`."""
 
     t: np.ndarray
-    values: np.ndarray
+    gyro: np.ndarray
+    accel: np.ndarray
     means: np.ndarray
     variance: np.ndarray
     walk: np.ndarray
@@ -65,9 +66,10 @@ class Increment(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _part(readings, j, c, a, b):
-    """Mean and change of signal c (0 to 5) from a to b in interval j; -1/2 is its first stamp, 1/2 its last."""
-    x0, x1, mean = readings.values[j, c], readings.values[j + 1, c], readings.means[j, c]
+def _part(x, j, c, mean, a, b):
+    """Mean and change of column c of x (N, 3) from a to b in interval j, over which its mean is `mean`; -1/2 is the
+    first stamp, 1/2 the last."""
+    x0, x1 = x[j, c], x[j + 1, c]
     slope, bend = x1 - x0, 3.0 * (x0 + x1) - 6.0 * mean
     return (
         mean + 0.5 * slope * (a + b) + bend * ((a * a + a * b + b * b) / 3.0 - 1.0 / 12.0),
@@ -78,12 +80,13 @@ def _part(readings, j, c, a, b):
 @njit(cache=True, nogil=True)
 def _part_of_signals(readings, j, a, b):
     """`_part` of rate and specific force: their means, then their changes, (3,) each."""
-    w0, d0 = _part(readings, j, 0, a, b)
-    w1, d1 = _part(readings, j, 1, a, b)
-    w2, d2 = _part(readings, j, 2, a, b)
-    f0, e0 = _part(readings, j, 3, a, b)
-    f1, e1 = _part(readings, j, 4, a, b)
-    f2, e2 = _part(readings, j, 5, a, b)
+    gyro, accel, means = readings.gyro, readings.accel, readings.means
+    w0, d0 = _part(gyro, j, 0, means[j, 0], a, b)
+    w1, d1 = _part(gyro, j, 1, means[j, 1], a, b)
+    w2, d2 = _part(gyro, j, 2, means[j, 2], a, b)
+    f0, e0 = _part(accel, j, 0, means[j, 3], a, b)
+    f1, e1 = _part(accel, j, 1, means[j, 4], a, b)
+    f2, e2 = _part(accel, j, 2, means[j, 5], a, b)
     return (w0, w1, w2), (f0, f1, f2), (d0, d1, d2), (e0, e1, e2)
 
 
