@@ -276,10 +276,11 @@ def test_nearest_keyframe(scheme, time, keyframe):
     assert assign_keyframes(scheme, N_KEYFRAMES, np.array([time]))[0] == keyframe
 
 
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
 @pytest.mark.parametrize("time", [0.5, 2.0])
-def test_in_the_middle_the_later_keyframe_is_taken(time):
-    nearest = assign_keyframes("inertial", N_KEYFRAMES, np.array([time]))[0]
-    assert N_KEYFRAMES[nearest] > time
+def test_in_the_middle_the_earlier_keyframe_is_taken_whatever_the_rounding(time, rounding):
+    nearest = assign_keyframes("inertial", N_KEYFRAMES, np.array([time + rounding]))[0]
+    assert N_KEYFRAMES[nearest] < time
 
 
 @pytest.mark.parametrize(("time", "keyframe"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
