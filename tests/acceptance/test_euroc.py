@@ -140,7 +140,7 @@ def test_the_halves_as_two_recordings_give_the_whole(rig, whole, whole_fixed, cu
             a, b = whole_fixed.group(camera, name), joint.group(camera, name)
             difference = turn(a.value, b.value) if name == "rotation" else b.value - a.value
             assert np.abs(difference / a.std_formal).max() < 1.0
-            np.testing.assert_allclose(b.std_formal, a.std_formal, rtol=0.05)
+            np.testing.assert_allclose(b.std_formal, a.std_formal, rtol=0.07)
             np.testing.assert_allclose(b.std, a.std, rtol=0.5)
     tilts = [joint.group(name, "tilt").value[2] for name in ("board0", "board0 in recording 2")]
     assert np.linalg.norm(tilts[0] - tilts[1]) < 2e-3  # the board stood still
@@ -175,7 +175,7 @@ def test_the_rig_files_work_on_the_folder_of_the_whole_recording(euroc, rig_from
 
 
 def test_a_wrong_guess_of_everything_changes_nothing(rig, whole, unshifted):
-    """A guess is where the solver starts, and has no weight."""
+    """A guess is where the solver starts, and has no weight: the end moves by less than a formal sigma."""
     cameras = tuple(
         dataclasses.replace(
             c,
@@ -188,6 +188,7 @@ def test_a_wrong_guess_of_everything_changes_nothing(rig, whole, unshifted):
     found = calibrate_measurements(with_settings(rig.with_(cameras=cameras), segments=0), whole)
     for camera in CAMERAS:
         angle, distance = distances(found.T_imu_sensor(camera), unshifted.T_imu_sensor(camera))
-        assert angle < 1e-3
-        assert distance < 1e-2
+        turned, moved = (unshifted.group(camera, name).std_formal.max() for name in ("rotation", "translation"))
+        assert angle < np.rad2deg(turned), (angle, turned)
+        assert distance < 1e3 * moved, (distance, moved)
         assert abs(offset_ms(found, camera) - offset_ms(unshifted, camera)) < 1e-3

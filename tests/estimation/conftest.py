@@ -409,7 +409,7 @@ def unlike_cameras(duration_s: float, asynchronous: bool = True) -> Scenario:
     cam0, cam1 = scenario.cameras
     cam1 = replace(cam1, model="pinhole-equidistant", distortion=(-0.02, 0.01, -0.004, 0.001))
     intrinsics = np.random.default_rng(7).normal(size=24) * np.repeat([5e-3, 5e-3, 1e-2, 1e-3], [6, 6, 3, 9])
-    return replace(scenario, cameras=(cam0, cam1), imu_intrinsics=intrinsics, imu_rate_hz=200.0)
+    return replace(scenario, cameras=(cam0, cam1), imu_intrinsics=intrinsics)
 
 
 @pytest.fixture(scope="session")

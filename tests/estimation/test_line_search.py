@@ -13,7 +13,7 @@ from tests.typed import StandIn
 from icalib.estimate.problem.solver import minimise
 from icalib.estimate.problem.solver_options import SolverOptions
 from icalib.optim.anderson import Accelerator
-from icalib.optim.arrowhead import make_pieces
+from icalib.optim.arrowhead import make_pieces, solve
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.state import State, make_layout
 
@@ -35,6 +35,9 @@ class OneNumber(StandIn):
 
     def warm_started(self, residuals):
         return self
+
+    def solve(self, pieces, damping=0.0):
+        return solve(pieces, self.n_keyframes, self.tolerance, damping, self.fixed_directions)
 
     def rows(self, y: float) -> tuple[np.ndarray, np.ndarray]:
         """Residuals and their slopes."""

@@ -57,6 +57,7 @@ def world(request):
     origins_s = (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
+        ("world", "gravity"): np.array([9.81]),
         ("mocap0", "scale"): np.array([mocap.scale]),
         ("mocap0", "rotation"): mocap.T_imu_sensor[:3, :3].copy(),
         ("mocap0", "translation"): mocap.T_imu_sensor[:3, 3].copy(),

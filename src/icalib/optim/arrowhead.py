@@ -158,7 +158,7 @@ class Factors:
     information: np.ndarray
     tolerance: np.ndarray
     fixed_directions: np.ndarray
-    essential: np.ndarray | None
+    essential: np.ndarray | None = None
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
         """Back substitution of m right-hand sides: steps (K, 15, m) of the keyframes.

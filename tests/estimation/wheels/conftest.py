@@ -18,7 +18,7 @@ from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.motion.sweep import EstimatedMotion
-from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
+from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, solve
 from icalib.optim.calib_block import NO_DIRECTIONS
 from icalib.optim.prior_factor import Prior
 from icalib.optim.state import Layout, State, make_layout
@@ -207,6 +207,7 @@ def make_world(
     R, p, v = drive.pose(keyframes)
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
+        ("world", "gravity"): np.array([9.81]),
         ("wheel0", "rotation"): drive.R_imu_wheel,
         ("wheel0", "translation"): drive.p_imu_wheel,
         ("wheel0", "time_offset"): np.array([offset]),
@@ -268,6 +269,9 @@ class DriveProblem:
 
     def pieces(self):
         return make_pieces(self.n_keyframes, self.layout.size)
+
+    def solve(self, pieces, damping=0.0):
+        return solve(pieces, self.n_keyframes, self.tolerance, damping, self.fixed_directions, self.layout.essential)
 
     def residuals(self):
         return self.imu.output(), self.wheels.output()
