@@ -207,7 +207,6 @@ def make_world(
     R, p, v = drive.pose(keyframes)
     values = {
         ("imu0", "intrinsics"): np.zeros(24),
-        ("world", "gravity"): np.array([9.81]),
         ("wheel0", "rotation"): drive.R_imu_wheel,
         ("wheel0", "translation"): drive.p_imu_wheel,
         ("wheel0", "time_offset"): np.array([offset]),
