@@ -94,7 +94,7 @@ def test_with_changes_one_thing_and_names_what_there_is():
     changed = rig.with_("cam1", intrinsics=kept).with_("settings", loss="cauchy").with_(gravity=9.80665)
     assert changed.cameras == (rig.cameras[0], Camera("cam1", "cam1", "eucm", (9, 9), intrinsics=kept))
     assert changed.settings == Settings(loss="cauchy") and changed.gravity == 9.80665
-    assert (changed.imu, changed.lidars, rig.gravity) == (rig.imu, rig.lidars, 9.81)
+    assert (changed.imu, changed.lidars, rig.gravity) == (rig.imu, rig.lidars, 9.806)
     assert rig.with_("imu0", gyro_unit="deg/s").imu == ImuSensor(
         "imu0", "imu0", ImuNoise(1, 1, 1, 1), gyro_unit="deg/s"
     )

@@ -173,7 +173,7 @@ def test_vins_fusion(robot: Calibration, tmp_path: Path):
     # Of a reading at 200 Hz.
     assert storage.getNode("acc_n").real() == pytest.approx(2.8e-3 * 200**0.5, rel=1e-12)
     assert storage.getNode("gyr_w").real() == pytest.approx(2.2e-5 * 200**0.5, rel=1e-12)
-    assert storage.getNode("g_norm").real() == 9.81
+    assert storage.getNode("g_norm").real() == 9.806
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,7 @@ def test_lio_sam(robot: Calibration):
     R_world_lidar = R_world_imu @ np.linalg.inv(np.reshape(data["extrinsicRPY"], (3, 3)))
     np.testing.assert_allclose(R_world_lidar, R_world_imu @ T[:3, :3], atol=1e-12)
     names = ("imuAccNoise", "imuGyrNoise", "imuAccBiasN", "imuGyrBiasN", "imuGravity")
-    assert [data[n] for n in names] == [2.8e-3, 1.6e-4, 8.6e-4, 2.2e-5, 9.81]
+    assert [data[n] for n in names] == [2.8e-3, 1.6e-4, 8.6e-4, 2.2e-5, 9.806]
     assert "the time offset of lidar0 (-10.000 ms)" in found.sentences[0]
 
 

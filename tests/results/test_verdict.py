@@ -129,7 +129,7 @@ def test_every_component_of_a_bad_verdict_is_in_the_reasons(calibration: Calibra
     assert "cam0 translation x" in uncertain and "cam1 time offset" in weak
 
 
-@pytest.mark.parametrize("verdict", ["weak", "undetermined"])
+@pytest.mark.parametrize("verdict", ["weak", "too uncertain"])
 def test_the_prior_of_the_imu_is_named_before_motion_is_asked_for(calibration: Calibration, verdict: str):
     """Where it contributes most of the variance: here of cam0, not of cam1."""
     c, share = with_verdicts(calibration, verdict, ("rotation",)), {"cam0": 0.8, "cam1": 0.6}

@@ -101,6 +101,13 @@ def guessed_poses(c: Calibration) -> tuple[str, ...]:
     return guesses(in_body_frame(c), tuple(dict.fromkeys((*c.mounted, *c.on_body))))
 
 
+def gravity(c: Calibration) -> float:
+    """Magnitude of gravity [m/s^2]: the estimate, or what the rig file states."""
+    stated = c.rig["gravity"]
+    mean = stated["prior"] if isinstance(stated, dict) else stated
+    return float(next((g.value[0] for g in c.groups if g.name == "gravity"), mean))
+
+
 def others(c: Calibration, *covered: str) -> list[str]:
     """Names of all mounted sensors except `covered`, those that the format represents."""
     return [name for name in c.mounted if name not in covered]

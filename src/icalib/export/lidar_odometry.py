@@ -7,6 +7,7 @@ from typing import Any
 from icalib.export.common import (
     CameraParameters,
     Export,
+    gravity,
     guesses,
     imu_intrinsics,
     inverse,
@@ -109,7 +110,7 @@ def lio_sam(c: Calibration) -> Export:
         rotation = T[:3, :3].ravel().tolist()
         data = {"pointCloudTopic": topic(c, name, f"/{name}"), "imuTopic": topic(c, imu, f"/{imu}")}
         data |= {theirs: float(noise[ours]) for theirs, ours in fields.items()}
-        data |= {"imuGravity": float(c.rig["gravity"]), "extrinsicTrans": T[:3, 3].tolist()}
+        data |= {"imuGravity": gravity(c), "extrinsicTrans": T[:3, 3].tolist()}
         data |= {"extrinsicRot": rotation, "extrinsicRPY": list(rotation)}
         files[f"{name}.yaml"] = yaml_text([*comments, *sentences], {"lio_sam": data})
     return Export(files, sentences)

@@ -8,6 +8,7 @@ from icalib.errors import CalibrationError
 from icalib.export.common import (
     CameraParameters,
     Export,
+    gravity,
     guesses,
     imu_intrinsics,
     lens_of,
@@ -69,7 +70,7 @@ def _main(
     for i, name in enumerate(names):
         lines += opencv_matrix(f"body_T_cam{i}", c.T_imu_sensor(name))
     lines += _noise(c, imu)
-    lines += [f"g_norm: {float(c.rig['gravity'])!r}", "estimate_td: 0"]
+    lines += [f"g_norm: {gravity(c)!r}", "estimate_td: 0"]
     lines.append("# What to add to an image's stamp to have the IMU's clock [s].")
     lines.append(f"td: {time_offset(c, names[0])!r}")
     return "\n".join(lines) + "\n"

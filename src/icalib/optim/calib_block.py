@@ -26,7 +26,7 @@ def calib_step(
     information (B, B), gradient (B,): of half the chi^2, chain marginalised. essential: columns of all but nuisance
     parameters (default: all). Fixed are the orthonormal columns of `fixed_directions` (B, m), and eigenvectors below
     UNOBSERVABLE_BELOW of the information of the essential parameters in units of `tolerance` (B,). Nuisance parameters
-    count as known there: their priors bound a direction that only they leave open.
+    count as known there: their priors bound a direction that only they move.
     """
     free, root = _free_root(information, tolerance, fixed_directions, essential)
     projected = root.T @ (free.T @ (tolerance * gradient))

@@ -116,6 +116,8 @@ def stamp_scatter(stamps_ns: np.ndarray) -> float:
     """Standard deviation [s] of stamps (N,) [ns] about an even grid, from their steps; 0 if the steps are whole periods
     but for a few."""
     step = np.diff(stamps_ns).astype(np.float64)
+    if not len(step):
+        return 0.0
     period = float(np.median(step[step > _BURST_STEP_PERIODS * usual_step(stamps_ns)])) if step.any() else 1.0
     off = step - period * np.maximum(np.round(step / period), 1.0)
     uneven = bool((np.abs(off) > _UNEVEN_NS).mean() > _MIN_UNEVEN_STEP_SHARE)
