@@ -22,14 +22,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, eigh
 
 from icalib.errors import EstimationError
-from icalib.estimate.estimate import (
-    EARLY_PASS,
-    NO_CALLBACKS,
-    Callbacks,
-    Estimate,
-    EstimateOptions,
-    estimate,
-)
+from icalib.estimate.estimate import EARLY_PASS, NO_CALLBACKS, Callbacks, Estimate, EstimateOptions, estimate
 from icalib.estimate.problem.assembly import given_priors
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.problem.outcome import Outcome

@@ -7,13 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.data.recordings import TopicInfo
-from icalib.sensors.camera.inspect.facts import (
-    TargetView,
-    camera_sources,
-    camera_views,
-    patterns,
-    without_target,
-)
+from icalib.sensors.camera.inspect.facts import TargetView, camera_sources, camera_views, patterns, without_target
 from icalib.tools.inspection.facts import Finding, Inspection, imu_timing, overlap_s, words_on_gaps
 from icalib.tools.inspection.kinds import inertial, rolls
 
