@@ -30,7 +30,7 @@ def with_even_stamps(read: Sequence[ReadImages], where: Mapping[str, str]) -> li
         for k in group:
             stream, notes = read[k]
             if even is None:
-                evened[k] = replace(stream, jitter_s=stamp_scatter(stamps_ns)), notes
+                evened[k] = replace(stream, jitter_s=stamp_scatter(stream.stamps_ns)), notes
             else:
                 evened[k] = _moved(stream, stamps_ns, even), (*notes, even.note(where[stream.name], "images"))
     return evened
