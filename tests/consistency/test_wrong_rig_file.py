@@ -67,13 +67,13 @@ def test_noise_that_is_far_too_small_is_said(simulation, times):
 
 @pytest.mark.parametrize("times", [0.5, 0.1, 10.0])
 def test_the_noise_that_is_advised_is_the_true_one(simulation, times):
-    """To a third, whether far too small or too large is stated; calibrated with it there is nothing left to say."""
+    """To two fifths, as few degrees of freedom are left, whether far too small or too large is stated; calibrated with it there is nothing left to say."""
     (words,) = said(with_noise(simulation, times))
     assert f"too {'small' if times < 1.0 else 'large'}" in words
     noise, found = not_none(rig_for(simulation.scenario).imu).noise, advised(words)
     assert set(found) == {"gyro", "gyro_walk", "accel", "accel_walk"}
     for name, value in found.items():
-        assert 0.67 < value / getattr(noise, name) < 1.5, (name, value)
+        assert 0.6 < value / getattr(noise, name) < 1.5, (name, value)
     rig = rig_for(simulation.scenario)
     rig = rig.with_(imu=replace(not_none(rig.imu), noise=replace(noise, **found)))
     assert said(calibrate_measurements(rig, simulation.measurements)) == []
