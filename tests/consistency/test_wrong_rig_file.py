@@ -67,7 +67,8 @@ def test_noise_that_is_far_too_small_is_said(simulation, times):
 
 @pytest.mark.parametrize("times", [0.5, 0.1, 10.0])
 def test_the_noise_that_is_advised_is_the_true_one(simulation, times):
-    """To two fifths, as few degrees of freedom are left, whether far too small or too large is stated; calibrated with it there is nothing left to say."""
+    """To two fifths, as few degrees of freedom are left, whether far too small or too large is stated; calibrated with
+    it there is nothing left to say."""
     (words,) = said(with_noise(simulation, times))
     assert f"too {'small' if times < 1.0 else 'large'}" in words
     noise, found = not_none(rig_for(simulation.scenario).imu).noise, advised(words)

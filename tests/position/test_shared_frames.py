@@ -21,7 +21,14 @@ pytestmark = pytest.mark.slow
 OTHER = np.array([-0.5, 0.2, 0.3])
 FRAME = pose([3.0, -1.0, 0.5], 2.1)
 LENS = (460.0, 460.0, 375.5, 239.5), (-0.28, 0.07, 0.0, 0.0)
-SILENT = {"imu_noise_enabled": False, "corner_noise_enabled": False, "robot_noise_enabled": False}
+SILENT = {
+    "imu_noise_enabled": False,
+    "corner_noise_enabled": False,
+    "robot_noise_enabled": False,
+    "imu_rate_hz": 2000.0,
+    "gyro_bias": (0.0,) * 3,
+    "accel_bias": (0.0,) * 3,
+}
 
 
 def with_target(duration_s=12.0, **fields):

@@ -118,6 +118,8 @@ def _trial(inputs: Inputs, estimate: Estimate, sensor: PoseSensor) -> str:
     """A sentence on whether kind: relative would help, from its residuals and normal equations at the solution."""
     if inputs.rig.imu is None or inputs.rig.assumes_motion:
         return "Relative poses need an IMU."
+    if any(getattr(other, "frame", "") == sensor.name for other in inputs.rig.mounted):
+        return "Relative poses have no frame, and another sensor shares that of these."
     tried = replace(inputs, rig=inputs.rig.with_sensors(replace(sensor, kind="relative")))
     tried = with_association(tried, inputs.association)
     model, state = estimate.measurement_model, estimate.outcome.state
