@@ -116,7 +116,7 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     if inputs.imu is None:
         return state
     near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
-    poses = poses_at("inertial", keyframes, near, state, inputs.imu, gravity_of(state), False)
+    poses = poses_at("inertial", keyframes, near, state, inputs.imu, gravity_of(state, inputs.rig.gravity), False)
     starts = first_keyframes(inputs.imu, keyframes)
     return State(
         keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts
@@ -171,7 +171,7 @@ def assemble(
 def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
     """Motion of the IMU between the keyframes of `state`."""
     assert inputs.imu is not None
-    return EstimatedMotion(state, inputs.imu, gravity_of(state), inputs.rig.settings.max_gap_s)
+    return EstimatedMotion(state, inputs.imu, gravity_of(state, inputs.rig.gravity), inputs.rig.settings.max_gap_s)
 
 
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:
