@@ -199,8 +199,8 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     if rig.imu is None or measurements.imu is None:
         return None
     forwards = rig.assumes_motion and _is_dense(measurements)
-    imu = ImuData.build(measurements.imu, rig.imu.noise, forwards, rig.imu.sampling)
-    return replace(imu, unit=_unit(rig))
+    imu, unit = ImuData.build(measurements.imu, rig.imu.noise, forwards, rig.imu.sampling), _unit(rig)
+    return imu if unit is None else replace(imu, unit=unit)  # a copy computes its signals anew
 
 
 def _unit(rig: Rig) -> Key | None:

@@ -19,9 +19,9 @@ from icalib.optim.state import State
 from icalib.rig.scene import GRAVITY, WORLD
 
 
-def gravity_of(state: State, stated: float = 0.0) -> float:
+def gravity_of(state: State, stated: float) -> float:
     """Magnitude of gravity [m/s^2] at `state`; `stated` where a state of the first guess has none."""
-    return float(state.values[WORLD, GRAVITY.name][0]) if (WORLD, GRAVITY.name) in state.values else stated
+    return float(state.values.get((WORLD, GRAVITY.name), [stated])[0])
 
 
 @dataclass(frozen=True)

@@ -201,7 +201,7 @@ class ImuFactor(RowFactor):
     """
 
     imu: ImuData
-    gravity: float  # [m/s^2], where it is not estimated
+    gravity: float  # [m/s^2], where the state has none
     columns: np.ndarray  # (24 or 0,) calibration columns of free intrinsics, and that of the unit of length if any
     gravity_column: np.ndarray  # (1,) that of the magnitude of gravity, or (0,)
     increments: Increments
@@ -284,7 +284,7 @@ class ImuFactor(RowFactor):
         del curved
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0
         dx = dx if self.increments.J.shape[2] > 6 else np.zeros(0)
-        gravity = gravity_of(state) if len(self.gravity_column) else self.gravity
+        gravity = gravity_of(state, self.gravity)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, gravity)
         unit, columns = self.imu.unit_length(state), np.concatenate([self.columns, self.gravity_column])
         return _accumulate(piece.last, chain, self.increments, dx, unit, columns, piece.sums(sums), out.residual)
