@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -493,6 +494,56 @@ def test_empty_clouds(write, read):
     messages = [(t, cloud(make, t, VELODYNE, {"x": np.zeros(0)})) for t in scans().stamps.tolist()]
     with pytest.raises(RecordingError, match="0 of 12 clouds have points"):
         read(messages)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"offset": 2**31 - 1},
+        {"offset": 2**32 - 1},
+        {"offset": VELODYNE.itemsize - 3},
+        {"count": 2**31},
+        {"count": 2**32 - 1},
+        {"datatype": 9},
+        {"datatype": 8, "offset": 15},
+        {"name": "x"},
+    ],
+)
+def test_fields_that_lie_beyond_a_point(write, read, wrong):
+    """numpy reads outside of the data at an offset near 2^31."""
+    make, found = write.maker(), scans()
+    messages = packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    last = messages[3][1].fields[-1]
+    messages[3][1].fields[-1] = dataclasses.replace(last, **wrong)
+    stream, notes = read(messages)
+    assert stream.stamps_ns.tolist() == np.delete(found.stamps, 3).tolist()
+    assert "1 of 12 messages are damaged and were left out" in notes[0]
+    with pytest.raises(RecordingError, match=r"is damaged \(.+\), and so are all others; copy or record the bag again"):
+        read([(t, dataclasses.replace(m, fields=messages[3][1].fields)) for t, m in messages])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"width": 2**32 - 1},
+        {"height": 2**32 - 1},
+        {"width": 2**31, "row_step": 0, "point_step": 0},
+        {"point_step": 2**32 - 1, "row_step": 2**32 - 1},
+        {"row_step": 0},
+        {"point_step": 0},
+        {"data": np.zeros(0, np.uint8)},
+    ],
+)
+def test_sizes_that_do_not_fit_the_data(write, read, wrong):
+    make, found = write.maker(), scans()
+    messages = packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
+    messages[5] = (messages[5][0], dataclasses.replace(messages[5][1], **wrong))
+    stream, notes = read(messages)
+    assert stream.stamps_ns.tolist() == np.delete(found.stamps, 5).tolist()
+    assert "1 of 12 messages are damaged and were left out" in notes[0]
+    none = {"width": 0, "row_step": 0, "point_step": 2**32 - 1, "data": np.zeros(0, np.uint8)}
+    messages[5] = (messages[5][0], dataclasses.replace(messages[5][1], **(wrong | none)))
+    assert "1 of 12 scans have no usable point and were left out" in read(messages)[1][0]
 
 
 def test_no_coordinates(write, read):

@@ -212,27 +212,37 @@ def point_clouds(bag: HasMessages, topic: str) -> Iterator[PointCloud]:
 
 
 def _points_of(message: Any) -> tuple[str, np.ndarray, int]:
-    """Frame, points and number of rows of a message. Raises ValueError if its data are too short for its points."""
+    """Frame, points and number of rows of a message. Raises ValueError if its data are too short for its points, or a
+    point for its fields."""
     m = message
     if isinstance(m, LivoxCloud):
         return m.header.frame_id, m.points, 1
     if len(m.data) < m.row_step * m.height or m.row_step < m.point_step * m.width:
         raise ValueError(f"{m.width * m.height} points do not fit {len(m.data)} bytes")
+    if not m.width * m.height:
+        return m.header.frame_id, np.empty(0), m.height
     kind = _point_type(m)
     rows = m.data[: m.row_step * m.height].reshape(m.height, m.row_step)[:, : m.point_step * m.width]
-    points = np.ascontiguousarray(rows).reshape(-1).view(kind) if rows.size else np.empty(0, kind)
-    return m.header.frame_id, points, m.height
+    return m.header.frame_id, np.ascontiguousarray(rows).reshape(-1).view(kind), m.height
+
+
+def _end(field: Any) -> int:
+    """Bytes from the begin of a point to the end of a PointField."""
+    return field.offset + max(field.count, 1) * int(_FIELD_TYPES[field.datatype][1])
 
 
 _FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}  # of PointField
 
 
 def _point_type(message: Any) -> np.dtype:
-    """Structured dtype of the points of a message. Raises ValueError if its fields cannot be read."""
+    """Structured dtype of the points of a message. Raises ValueError if its fields cannot be read, or lie beyond the
+    bytes of a point: numpy does not check large offsets."""
     order = ">" if message.is_bigendian else "<"
-    unknown = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES]
-    if unknown or message.point_step < 1:
-        raise ValueError(f"its point fields cannot be read: {', '.join(unknown) or 'they have 0 bytes'}")
+    wrong = [f.name for f in message.fields if f.datatype not in _FIELD_TYPES or _end(f) > message.point_step]
+    if wrong or message.point_step < 1:
+        raise ValueError(
+            f"its point fields cannot be read: {', '.join(wrong) or 'all'}, in points of {message.point_step} bytes"
+        )
     formats = [(order + _FIELD_TYPES[f.datatype], (f.count,) if f.count > 1 else ()) for f in message.fields]
     return np.dtype(
         {
