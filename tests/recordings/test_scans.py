@@ -279,7 +279,7 @@ def test_a_refusal_says_what_was_repaired_before(tmp_path, capsys):
     assert main(command) == 1
     out, error = capsys.readouterr()
     assert "Note: " in out and "they are read as ms, the only unit that fits" in out
-    assert error.count("\n") == 1 and "scans have 100 points or more" in error
+    assert error.count("\n") == 1 and "0 of 4 usable scans have 100 points or more, and 20 are needed" in error
     assert main([*command, "--quiet"]) == 1
     assert capsys.readouterr().out == ""
 

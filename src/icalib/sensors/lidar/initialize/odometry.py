@@ -86,8 +86,8 @@ def sampled_scans(stream: LidarStream) -> list[Scan]:
     scans = [s for s in scans if len(s.tau) >= MIN_SCAN_POINTS]
     if len(scans) < MIN_SCANS:
         raise EstimationError(
-            f"{stream.name}: only {len(scans)} of its {len(stream.stamps_ns)} scans have {MIN_SCAN_POINTS} points or "
-            "more; check its topic, or record for longer."
+            f"{stream.name}: {len(scans)} of {len(stream.stamps_ns)} usable scans have {MIN_SCAN_POINTS} points or "
+            f"more, and {MIN_SCANS} are needed; check its topic, or record for longer."
         )
     return scans
 
