@@ -14,7 +14,7 @@ from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection import images as image_work
 from icalib.detection.primitives.corners import ImageCorners, no_corners
 from icalib.errors import RecordingError
-from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets import AprilGrid, Markers, Scene
 from icalib.rig import Camera
 from icalib.sensors.camera.read import detected_corners
 
@@ -102,6 +102,28 @@ def test_another_layout_is_looked_for_where_little_of_a_grid_is_found(detector, 
     monkeypatch.setattr(detected_corners, "with_other_border", lambda images, tags, others: "")
     detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert asked == ([GRID] if found < 0.5 * len(GRID.points) else [])
+
+
+def test_many_single_tags_are_looked_for_once(detector, monkeypatch):
+    """Each tag is in few images, which is no reason to look for another border. Those in none are, in one pass."""
+    tags = Scene(tuple(f"tag{k}" for k in range(9)), tuple(Markers("tag36h11", 0.1, (k,)) for k in range(9)))
+    one = np.ones(4)
+    monkeypatch.setattr(
+        detector,
+        "detect",
+        lambda image, before=(): ImageCorners(
+            4 * (int(image[0, 0]) % 7) + np.arange(4), np.zeros((4, 2)), 0.1 * one, one, np.zeros(4, np.int8)
+        ),
+    )
+    asked = []
+    monkeypatch.setattr(detected_corners, "with_other_border", lambda views, tags, others: asked.append(tags.ids) or "")
+    recording = FakeRecording()
+    _, notes = detected_corners.find_corners(recording, CAMERA, tags)
+    assert asked == [(7,), (8,)] and recording.read <= 3 * recording.n
+    assert "tag0 is in 3, tag1 is in 3" in notes[0] and notes[1].startswith("fake.bag /cam0: tag7 and tag8 is never")
+    asked.clear()
+    detected_corners.find_corners(recording, CAMERA, Scene(tags.names[:7], tags.targets[:7]))
+    assert asked == [] and recording.read <= 5 * recording.n
 
 
 def test_a_second_run_looks_at_nothing(detector):

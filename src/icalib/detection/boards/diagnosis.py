@@ -73,8 +73,8 @@ def tags_in(images: Sequence[np.ndarray]) -> str:
     return "" if tags is None else _words(tags)
 
 
-def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterable[TagSet]) -> str:
-    """A sentence if the first images (h, w) uint8 show the target's `tags` with the other border width, and hardly any
+def with_other_border(views: Iterable[ImageWithQuads], tags: TagSet, others: Iterable[TagSet]) -> str:
+    """A sentence if the first images show the target's `tags` with the other border width, and hardly any
     with the stated one; else "". others: tags that may be in the images, too.
 
     A tag with the other border width is sometimes decoded, but with wrong corners.
@@ -82,8 +82,7 @@ def with_other_border(images: Iterable[np.ndarray], tags: TagSet, others: Iterab
     swapped = TagSet(tags.family, 3 - tags.border_bits, tags.ids)
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
     ids_by_border: dict[int, list[np.ndarray]] = {1: [], 2: []}
-    for image in islice(images, _DIAGNOSED_IMAGES):
-        view = ImageWithQuads(image)
+    for view in islice(views, _DIAGNOSED_IMAGES):
         quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for border, decoded_ids in ids_by_border.items():
             read = tags_at(view.image, quads, tag_family(tags.family), border).ids
