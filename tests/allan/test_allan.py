@@ -529,3 +529,11 @@ def test_a_bag_gives_what_its_table_gives(tmp_path: Path, form: BagForm):
     assert right.white == pytest.approx(2.0 * table.white, rel=1e-6)
     with pytest.raises(RecordingError, match="has several IMUs, /left/imu, /right/imu; give one as --imu"):
         study_recording(bag)
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "gyroscope x"), (5, "accelerometer z"), (slice(None), "gyroscope x")])
+def test_an_axis_that_never_changes(axis, name: str):
+    readings = np.concatenate([(imu := at_rest(20.0, 100.0, 3)).gyro, imu.accel], axis=1)
+    readings[:, axis] = 0.25
+    with pytest.raises(EstimationError, match=rf"imu0: the {name} is 0.25 in all readings at rest, so its noise is un"):
+        study_imu(with_readings(imu, readings), "here")

@@ -95,8 +95,10 @@ def study_recording(
 
 def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoiseStudy:
     """Noise densities, bias walks and Allan deviations of `imu`; where, notes: for the result. Raises EstimationError
-    if the IMU was not at rest for 10 s."""
+    if the IMU was not at rest for 10 s, or an axis never changes."""
+    _refuse_constant(imu.name, np.concatenate([imu.gyro, imu.accel], axis=1))
     still = still_readings(imu)
+    _refuse_constant(imu.name, still.readings)
     gyro = _sensor_noise("gyroscope", "rad/s", [part[:, :3] for part in still.stretches], still.period)
     accel = _sensor_noise("accelerometer", "m/s^2", [part[:, 3:] for part in still.stretches], still.period)
     rounding = _rounding(gyro.kind, still.readings[:, :3]) + _rounding(accel.kind, still.readings[:, 3:])
@@ -140,6 +142,17 @@ def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: flo
         instability_tau=tau,
         open=tuple(bool(t in ends) for t in tau),
     )
+
+
+def _refuse_constant(name: str, readings: np.ndarray) -> None:
+    """Raises EstimationError if an axis of the readings (n, 6) never changes: its noise has no spectrum."""
+    constant = np.flatnonzero(np.ptp(readings, axis=0) == 0)
+    if len(constant):
+        axis = f"{('gyroscope', 'accelerometer')[constant[0] // 3]} {AXES[constant[0] % 3]}"
+        raise EstimationError(
+            f"{name}: the {axis} is {readings[0, constant[0]]:g} in all readings at rest, so its noise is unknown; "
+            "check the driver, set a narrower range, or record more digits."
+        )
 
 
 def _unit_warnings(gyro: float, accel: float) -> tuple[str, ...]:
