@@ -32,6 +32,7 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
+from icalib.base.input_files import regular
 from icalib.errors import CalibrationError
 
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,99}")  # valid name of a sensor or target
@@ -308,7 +309,7 @@ def read_file(folder: Path, name: str) -> bytes:
     committed = [] if _commit(folder) is None else [folder / COMMIT / name]
     for path in (*committed, folder / name):
         try:
-            return path.read_bytes()
+            return regular(path).read_bytes()
         except FileNotFoundError:
             continue
         except OSError as error:

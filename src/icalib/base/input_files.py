@@ -13,12 +13,14 @@ import gzip
 import hashlib
 import io
 import math
+import stat
 import struct
 import threading
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Collection
+from errno import EINVAL
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +29,13 @@ import numpy as np
 _NEAR = 1 << 20  # bytes: a gap up to this (headers, an index) between two blocks is read at once, to continue the hash
 _BLOCK = 1 << 14  # bytes per read of `FileHash` itself; small, so that it needs no noticeable memory
 _MOST = 200_000  # remembered hashes; each takes 0.5 kB
+
+
+def regular(path: Path) -> Path:
+    """`path`. Raises OSError if it does not exist, or is a pipe or a device, which may have no end."""
+    if not (stat.S_ISREG(mode := path.stat().st_mode) or stat.S_ISDIR(mode)):
+        raise OSError(EINVAL, "a pipe or a device, not a file", str(path))
+    return path
 
 
 class FileHash:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
+from itertools import chain
+from math import inf
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import yaml
 
+from icalib.base.input_files import regular
 from icalib.base.suggestion import suggestion
 from icalib.errors import RigError
 
 LARGEST_INTEGER = 2**63 - 1  # largest int64, the type of timestamps
-_LARGEST = 1e20  # largest absolute number; small enough that its powers in later computations are finite
+_MOST = 1 << 20  # characters of a file, and values with all aliases written out; a value takes some 1000 bytes
+LARGEST = 1e20  # largest absolute number; small enough that its powers in later computations are finite
 _INTEGER = re.compile(r"[-+]?[0-9]{1,19}")
 
 # Former names of fields, for the error that names the new one.
@@ -96,6 +100,8 @@ class YamlValue:
     def text(self) -> str:
         if not isinstance(self.node, yaml.ScalarNode) or not str(self.node.value).strip():
             self.fail(f"must be text, but is {self.summary()}.")
+        if "\0" in self.node.value:
+            self.fail(f"must be text without zero bytes, but is {self.summary()}.")
         return str(self.node.value)
 
     def choice(self, noun: str, available: tuple[str, ...]) -> str:
@@ -123,7 +129,7 @@ class YamlValue:
             value = float(text)
         except ValueError:
             self.fail(f"must be a number, but is {self.summary()}.")
-        if not abs(value) < _LARGEST:
+        if not abs(value) < LARGEST:
             self.fail(f"is too large a number ({self.summary()}).")
         return value
 
@@ -168,23 +174,26 @@ class YamlValue:
 def read_yaml(path: Path, kind: str = "rig file") -> YamlValue:
     """Root value of the YAML file at `path`, parsed without running its tags. kind: noun for the file in messages.
 
-    Raises RigError if the file does not exist, cannot be read, is not YAML or is empty.
+    Raises RigError if the file does not exist, cannot be read, is too large, is not YAML or is empty.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        with regular(path).open(encoding="utf-8-sig") as file:
+            text = file.read(_MOST + 1)
     except FileNotFoundError:
         raise RigError(f"{path} does not exist; check the path of the {kind}.") from None
     except OSError as error:
         raise RigError(f"{path} cannot be read ({error.strerror or error}); give the path of a {kind}.") from error
     except UnicodeDecodeError as error:
         raise RigError(f"{path} is not a text file in UTF-8 ({error.reason}); give a YAML file.") from error
+    if len(text) > _MOST:
+        raise RigError(f"{path} is larger than {_MOST >> 20} MiB; give the path of a {kind}.")
     return parse_yaml(text, str(path), kind)
 
 
 def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
     """Root value of the YAML `text`, parsed without running its tags. path, kind: its name and a noun, for messages.
 
-    Raises RigError if the text is not YAML or is empty.
+    Raises RigError if the text is not YAML or is empty, or its aliases stand for too many values.
     """
     try:
         # OpenCV writes `%YAML:1.0` in the first line, which is not a valid YAML directive.
@@ -199,7 +208,19 @@ def parse_yaml(text: str, path: str, kind: str = "rig file") -> YamlValue:
         raise RigError(f"{path} is not valid YAML ({_reason(error)}); correct it.") from error
     if root is None:
         raise RigError(f"{path} is empty; give a {kind}.")
+    if _written_out(root, {}) > _MOST:
+        raise RigError(f"{path}: its aliases (*name) stand for more than {_MOST} values; write them out.")
     return YamlValue(root, path, "")
+
+
+def _written_out(value: Any, counts: dict[int, float]) -> float:
+    """Number of values in `value` with its aliases written out, infinite if one contains itself. counts: by id, as far
+    as known."""
+    if id(value) not in counts:
+        counts[id(value)] = inf
+        parts = chain.from_iterable(value.value) if isinstance(value, yaml.MappingNode) else value.value
+        counts[id(value)] = 1 + sum(_written_out(p, counts) for p in parts if isinstance(p, yaml.Node))
+    return counts[id(value)]
 
 
 def _reason(error: Exception) -> str:

@@ -9,7 +9,7 @@ import weakref
 from pathlib import Path
 
 from icalib.base.extras import load_zstd
-from icalib.base.input_files import HEAD_BYTES, HashedFile, TooLargeError, copy_unpacked, not_data
+from icalib.base.input_files import HEAD_BYTES, HashedFile, TooLargeError, copy_unpacked, not_data, regular
 from icalib.base.yaml_nodes import read_yaml
 from icalib.data.bags.mcap import MCAP_MAGIC, McapStorage
 from icalib.data.bags.ros1 import ROS1_MAGIC, Ros1Storage
@@ -33,7 +33,7 @@ def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
 
     Raises RecordingError if no file can be read.
     """
-    if path.is_file():
+    if not path.is_dir():
         return [open_storage(path)], []
     files = bag_files(path)
     notes = [f"{path}: metadata.yaml lists {name}, which does not exist." for name in _absent(path)]
@@ -55,7 +55,7 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
     empty, damaged or no bag."""
     name = name or path
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             head = file.read(HEAD_BYTES)
         if not head:
             raise RecordingError(f"{name} is empty; record or copy it again.")

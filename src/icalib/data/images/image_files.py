@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from icalib.base.extras import load_cv2
-from icalib.base.input_files import HEAD_BYTES, VIDEO_FILE, hash_of, is_video, not_data
+from icalib.base.input_files import HEAD_BYTES, VIDEO_FILE, hash_of, is_video, not_data, regular
 from icalib.data.images.image_checks import Note, ignore
 from icalib.data.images.images import Payload, file_payload
 from icalib.data.stamps.clocks import is_rate, nanoseconds, unit_by_date, unit_of_stamps
@@ -210,7 +210,7 @@ def stamp_table(path: Path) -> Path | None:
 
 def _has_stamps(table: Path, video: str, count: int) -> bool:
     """Whether the table has `count` increasing stamps."""
-    lines = table.read_bytes().count(b"\n")
+    lines = regular(table).read_bytes().count(b"\n")
     if not 0 <= lines + 1 - count <= _MAX_HEADER_LINES:
         return False
     try:

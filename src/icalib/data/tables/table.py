@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.input_files import HEAD_BYTES, TooLargeError, gunzipped, hash_of, not_data
+from icalib.base.input_files import HEAD_BYTES, TooLargeError, gunzipped, hash_of, not_data, regular
 from icalib.data.images.image_checks import Note, ignore
 from icalib.data.stamps.clocks import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
 from icalib.data.tables.columns import TableKind, contradicts, places_by_name, places_given, split_kind
@@ -147,7 +147,7 @@ def _names_all(kind: TableKind, header: Sequence[str]) -> bool:
 
 
 def _text_of(path: Path) -> _Text:
-    content = _read_bytes(path)
+    content = read_bytes(path)
     begin, line, before = _skip_header(content)
     rows = content[begin:] if begin else content
     first = rows[: rows.find(b"\n") if b"\n" in rows else None].strip()
@@ -161,14 +161,16 @@ def _text_of(path: Path) -> _Text:
     return _Text(path, rows, line, _names(before, columns), columns)
 
 
-def _read_bytes(path: Path) -> bytes:
+def read_bytes(path: Path) -> bytes:
+    """Content of a text file, unpacked if gzipped, without a byte order mark. Raises RecordingError if it is empty, or
+    cannot be read or unpacked."""
     try:
-        content = path.read_bytes()
+        content = regular(path).read_bytes()
         hash_of(path).saw(0, content)
         if path.suffix == ".gz" or content.startswith(_GZIP_MAGIC):
             content = gunzipped(content)
     except TooLargeError as error:
-        raise RecordingError(f"{path} is not a table: {error}; unpack it with gunzip and check its content.") from error
+        raise RecordingError(f"{path} is not used: {error}; unpack it with gunzip and check its content.") from error
     except (EOFError, gzip.BadGzipFile, zlib.error) as error:
         raise RecordingError(f"{path} is a damaged or truncated gzip file ({error}); copy it again.") from error
     except OSError as error:

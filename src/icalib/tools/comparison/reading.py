@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+from icalib.base.input_files import regular
 from icalib.base.suggestion import suggestion
 from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import CalibrationError, RigError
@@ -86,7 +87,7 @@ def _is_urdf(path: Path) -> bool:
     if path.suffix in (".urdf", ".xacro"):
         return True
     try:
-        with path.open("rb") as file:
+        with regular(path).open("rb") as file:
             return file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(_XML)
     except OSError:
         return False

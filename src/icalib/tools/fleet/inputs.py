@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from icalib.base.input_files import regular
 from icalib.tools.batch import program
 from icalib.tools.fleet.jobs import Job
 
@@ -38,7 +39,7 @@ _CHANGED = {"rig": "the rig file changed", "recordings": "the recording changed"
 
 def _content(path: Path) -> str:
     try:
-        return hashlib.sha256(path.read_bytes()).hexdigest()
+        return hashlib.sha256(regular(path).read_bytes()).hexdigest()
     except OSError:
         return "absent"
 

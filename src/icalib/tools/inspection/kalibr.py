@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 import yaml
 
+from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import RigError
 from icalib.export.kalibr import KALIBR_MODELS, KALIBR_NOISE
 from icalib.geometry.targets import AprilGrid, Checkerboard, Target
@@ -129,8 +130,8 @@ def _entries(folder: Path) -> list[Path]:
 def yaml_mapping(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; empty if the file cannot be parsed or is no mapping."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError, RecursionError):
+        data = yaml.SafeLoader("").construct_document(read_yaml(path).node)
+    except (RigError, ValueError, yaml.YAMLError, RecursionError):
         return {}
     return data if isinstance(data, dict) else {}
 

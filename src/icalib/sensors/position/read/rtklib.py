@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.base.input_files import hash_of
+from icalib.data.tables.table import read_bytes
 from icalib.errors import RecordingError
 from icalib.sensors.position.spec import STATUSES
 
@@ -45,14 +45,7 @@ class PosFile:
 
 def read_pos(path: Path) -> PosFile:
     """The solutions in a `.pos` file, which may be gzipped. Raises RecordingError naming file and line."""
-    try:
-        content = path.read_bytes()
-        hash_of(path).saw(0, content)
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be read ({error.strerror or error}); check the file.") from error
-    if path.suffix == ".gz" or content.startswith(b"\x1f\x8b"):
-        content = _unpacked(path, content)
-    lines = content.decode("utf-8", "replace").splitlines()
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
     header = next((line for line in reversed(lines) if line.startswith("%") and "Q" in line.split()), "")
     names = [name.split("(")[0] for name in header.lstrip("% ").replace(",", " ").split()]
     kind = _kind(path, header, names)
@@ -77,15 +70,6 @@ def read_pos(path: Path) -> PosFile:
     return PosFile(
         np.array(stamps_ns, np.int64), names[0], kind, table[:, :3], _covariance(table, columns, kind), status
     )
-
-
-def _unpacked(path: Path, content: bytes) -> bytes:
-    from icalib.base.input_files import gunzipped  # noqa: PLC0415
-
-    try:
-        return gunzipped(content)
-    except (OSError, EOFError) as error:
-        raise RecordingError(f"{path} is a damaged gzip file ({error}); copy it again.") from error
 
 
 def _kind(path: Path, header: str, names: list[str]) -> str:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.input_files import regular
 from icalib.errors import RecordingError
 from icalib.tools.simulation.scenario.jets import Jet, Rows, Vector, matrices, values
 from icalib.tools.simulation.sensors.motion import readings_of
@@ -162,7 +163,7 @@ def _nanoseconds(text: str) -> int:
 
 def _lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8-sig").splitlines()
+        return regular(path).read_text(encoding="utf-8-sig").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error
         raise RecordingError(f"{path} cannot be read ({reason}); give the path of a trajectory.") from None
