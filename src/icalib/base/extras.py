@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 from types import ModuleType
 from typing import Any
 
@@ -16,6 +17,9 @@ def install(extra: str) -> str:
 
 def load_cv2() -> Any:
     """The module cv2 of OpenCV. Raises RecordingError where it is not installed."""
+    # OpenCV reads these when it is loaded. The largest image takes up to 1.6 GB while it is decoded.
+    for setting in ("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 28)), ("OPENCV_LOG_LEVEL", "OFF"):
+        os.environ.setdefault(*setting)
     return _load("cv2", "images", "Images and tags need OpenCV")
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from math import prod
 from typing import Any
 
 import numpy as np
 
 from icalib.base.extras import load_cv2
+from icalib.base.input_files import most_bytes
 from icalib.errors import RecordingError
 from icalib.sensors.stream import which_image
 
@@ -123,6 +125,14 @@ def file_size(data: bytes) -> tuple[int, int]:
     return 0, 0
 
 
+def _png_chunks(data: bytes) -> Iterator[int]:
+    """Stated sizes [bytes] of the chunks of a PNG; none for other files."""
+    at = len(_PNG) if data.startswith(_PNG) else len(data)
+    while at < len(data):
+        yield (size := int.from_bytes(data[at : at + 4]))
+        at += 12 + size  # with its size, name and checksum
+
+
 _PNG, _JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff"
 
 
@@ -155,7 +165,10 @@ def _decode_file(payload: Payload) -> np.ndarray:
 
 
 def _decoded(data: bytes) -> np.ndarray | None:
-    """Greyscale image with the bit depth of the file; None if it is damaged."""
+    """Greyscale image with the bit depth of the file; None if it is damaged, or has too many pixels for its bytes
+    (`most_bytes`). OpenCV allocates what the header and the chunks of a PNG state."""
+    if prod(file_size(data)) > most_bytes(len(data)) or any(n > len(data) for n in _png_chunks(data)):
+        return None
     cv2 = load_cv2()
     flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
