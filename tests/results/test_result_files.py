@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
 from icalib.base.files import COMMIT, check_writable, read_file, write_files
 from icalib.errors import CalibrationError
+from icalib.result import Calibration, calibration_files, load_calibration
 
 NAMES = ("calibration.yaml", "result.json", "result.npz")
 OLD, NEW = ({name: f"{word} {name}".encode() for name in NAMES} for word in ("old", "new"))
@@ -100,3 +102,18 @@ def test_a_target_that_is_no_folder(tmp_path: Path):
 def test_check_leaves_nothing_behind(tmp_path: Path):
     check_writable(tmp_path / "new")
     assert list((tmp_path / "new").iterdir()) == []
+
+
+@pytest.mark.parametrize("value", ["null", "NaN", "-Infinity", "1e300"])
+def test_values_that_are_no_numbers_are_not_loaded(calibration: Calibration, tmp_path: Path, value: str):
+    """Exports would hold axes of NaN."""
+    write_files(tmp_path, calibration_files(calibration))
+    whole = (tmp_path / "result.json").read_text(encoding="utf-8")
+    for name in ("translation", "rotation", "time_offset"):
+        group = next(g for g in calibration.groups if name in g.name)
+        plain = json.loads(whole)
+        values = next(g for g in plain["groups"] if (g["sensor"], g["name"]) == (group.sensor, group.name))["value"]
+        (values[0] if isinstance(values[0], list) else values)[0] = "here"
+        (tmp_path / "result.json").write_text(json.dumps(plain).replace('"here"', value), encoding="utf-8")
+        with pytest.raises(CalibrationError, match=f"{group.sensor}.{group.name} holds a value that is no number, or"):
+            load_calibration(tmp_path)

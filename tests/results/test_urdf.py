@@ -201,7 +201,7 @@ def test_poses_in_a_file_are_read_as_ros_does(file: Path):
         ('cam0_joint" type="fixed"', 'cam0_joint" type="revolute"', {}, "joint cam0_joint above cam0 is revolute"),
         ('mast_joint" type="fixed"', 'mast_joint" type="prismatic"', {}, "joint mast_joint is prismatic, not"),
         ('xyz="0 0 1"', 'xyz="0 0 ${h}"', {}, r'joint mast_joint: xyz="0 0 \$\{h\}" is not three plain numbers'),
-        ('xyz="0 0 1"', 'xyz="0 0 nan"', {}, "is not three plain numbers"),
+        *(('xyz="0 0 1"', f'xyz="0 0 {x}"', {}, "is not three plain numbers") for x in ("nan", "-inf", "1e200")),
         ("", "", {"cam0": "base_link"}, "base_link is the root, so no joint can be set for it"),
         ("", "", {"imu0": "right_eye"}, "right_eye is below cam0; the sensors' links must not be above"),
         ('<child link="mast"/>', '<child link="cam0"/>', {}, "cam0 is the child of mast_joint and cam0_joint"),

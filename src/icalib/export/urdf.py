@@ -15,6 +15,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from icalib.base.input_files import regular
+from icalib.base.yaml_nodes import LARGEST
 from icalib.errors import CalibrationError
 from icalib.export.common import (
     Export,
@@ -262,7 +264,7 @@ class UrdfTree:
             values = [float(part) for part in text.split()]
         except ValueError:
             values = []
-        if len(values) != 3 or not np.isfinite(values).all():
+        if len(values) != 3 or not (np.abs(values) < LARGEST).all():
             raise self.fail(
                 f'joint {joint.name}: {name}="{text}" is not three plain numbers; expand the file first '
                 "(xacro robot.xacro > robot.urdf)."
@@ -273,7 +275,7 @@ class UrdfTree:
 def read_urdf(path: Path) -> UrdfTree:
     """Parse the file `path`. Raises CalibrationError if it cannot be read, is not XML, or has no robot element."""
     try:
-        content = path.read_bytes()
+        content = regular(path).read_bytes()
     except OSError as error:
         raise CalibrationError(f"{path} cannot be read ({error.strerror or error}); give a URDF file.") from error
     reader = _Reader(content)

@@ -14,6 +14,7 @@ import numpy as np
 
 from icalib.base.files import NAME, printable, read_file, sealed
 from icalib.base.input_files import load_arrays
+from icalib.base.yaml_nodes import LARGEST
 from icalib.errors import CalibrationError
 from icalib.result.calibration import (
     Calibration,
@@ -209,8 +210,8 @@ def _group(plain: dict[str, Any]) -> ParameterGroup:
 
 
 def _check(c: Calibration) -> None:
-    """Raise ValueError if the parts of the result are inconsistent: shapes, counts, column indices, names of
-    sensors."""
+    """Raise ValueError if the parts of the result are inconsistent: shapes, counts, column indices, names of sensors,
+    values that are no finite numbers."""
     n = len(c.covariance_names)
     for name in c.rig["sensors"]:
         if not NAME.fullmatch(name):
@@ -221,6 +222,8 @@ def _check(c: Calibration) -> None:
     if c.null_space.ndim != 2 or len(c.null_space) != n:
         raise ValueError(f"the null space has shape {c.null_space.shape}, but there are {n} names")
     for g in c.groups:
+        if not (np.abs(g.value) < LARGEST).all():
+            raise ValueError(f"{g.sensor}.{g.name} holds a value that is no number, or too large")
         size = len(g.labels)
         sizes = {len(g.std), len(g.std_formal), len(g.verdict), size}
         sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
