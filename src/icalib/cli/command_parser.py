@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 from math import inf
+from pathlib import Path
 from typing import Any, NoReturn
 
 from icalib.base.suggestion import suggestion
@@ -69,6 +70,14 @@ class CommandParser(argparse.ArgumentParser):
         """The first given option that does not exist; empty if all do. Abbreviations of options are valid."""
         options = (o.partition("=")[0] for o in self._arguments if o.startswith("--") and len(o) > 2)
         return next((o for o in options if not any(known.startswith(o) for known in self._options())), "")
+
+
+def file_path(text: str) -> Path:
+    """`type` of an option with a path. Raises ArgumentTypeError for an empty one, as of an unset variable of a shell,
+    which would be the current folder."""
+    if not text.strip() or "\0" in text:
+        raise argparse.ArgumentTypeError(f"must be a path, but is {text!r}")
+    return Path(text)
 
 
 def nonnegative_int(text: str) -> int:

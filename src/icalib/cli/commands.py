@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import sys
 import traceback
 import warnings
 from pathlib import Path
 
-from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, nonnegative_int
+from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, file_path, nonnegative_int
 from icalib.cli.result_commands import add_result_commands
 from icalib.cli.target_command import add_target_command
 from icalib.errors import CalibrationError
@@ -26,13 +27,14 @@ def main(arguments: list[str] | None = None) -> int:
             stream.reconfigure(errors="backslashreplace")
     options = _parser().parse_args(arguments)
     if arguments is None and not sys.warnoptions:
-        warnings.simplefilter("ignore", RuntimeWarning)  # warnings of numpy do not help a user
+        warnings.simplefilter("ignore")  # those of Python and numpy do not help a user
+        os.environ["PYTHONWARNINGS"] = "ignore"  # nor do those of worker processes
     try:
         code = options.run(options)
     except CalibrationError as error:
         for note in () if getattr(options, "quiet", False) else getattr(error, "__notes__", ()):
             print(f"Note: {note}")
-        print(f"icalib: {error}", file=sys.stderr)
+        print(f"icalib: {_one_line(str(error))}", file=sys.stderr)
         return getattr(options, "error_code", 1)
     except (OSError, MemoryError) as error:  # failures of the system, such as a full disk, without specific handling
         print(f"icalib: {_outside(error)}", file=sys.stderr)
@@ -44,6 +46,11 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"icalib: interrupted; {str(stop) or 'nothing was written.'}", file=sys.stderr)
         return 130
     return code or 0
+
+
+def _one_line(text: str) -> str:
+    """`text` in one line, in which names from files may have put control characters."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def _outside(error: OSError | MemoryError) -> str:
@@ -95,10 +102,10 @@ def _add_calibrate(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib calibrate rig.yaml run.bag --output result",
         "icalib calibrate rig.yaml monday.bag friday.bag -o result --from 5 --to 65 --strict",
     )
-    c.add_argument("rig", type=Path, help="rig file (rig.yaml)")
+    c.add_argument("rig", type=file_path, help="rig file (rig.yaml)")
     several = "bag or folder of the recording; several of one rig are solved jointly"
-    c.add_argument("recording", type=Path, nargs="+", help=several)
-    c.add_argument("--output", "-o", type=Path, required=True, help="folder for the results; created if absent")
+    c.add_argument("recording", type=file_path, nargs="+", help=several)
+    c.add_argument("--output", "-o", type=file_path, required=True, help="folder for the results; created if absent")
     add_part(c)
     c.add_argument(
         "--scheme",
@@ -131,11 +138,13 @@ def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib inspect run.bag",
         "icalib inspect run.bag --target aprilgrid.yaml --rig rig.yaml",
     )
-    c.add_argument("recording", type=Path, help="bag or folder of the recording")
-    c.add_argument("--rig", type=Path, metavar="FILE", help="write a draft of the rig file; never overwrites a file")
+    c.add_argument("recording", type=file_path, help="bag or folder of the recording")
+    c.add_argument(
+        "--rig", type=file_path, metavar="FILE", help="write a draft of the rig file; never overwrites a file"
+    )
     target = "YAML of the target, or a rig file: search the images for this target; default: not searched"
-    c.add_argument("--target", type=Path, metavar="FILE", help=target)
-    c.add_argument("--json", type=Path, metavar="FILE", help="write the results of the inspection as JSON")
+    c.add_argument("--target", type=file_path, metavar="FILE", help=target)
+    c.add_argument("--json", type=file_path, metavar="FILE", help="write the results of the inspection as JSON")
     add_part(c)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
     c.set_defaults(run=_inspect)
@@ -150,8 +159,8 @@ def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib simulate scenario.yaml --output run",
         "icalib simulate scenario.yaml -o run.bag --level sensor --seed 7",
     )
-    c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
-    c.add_argument("--output", "-o", type=Path, required=True, help="path of the recording; must not exist yet")
+    c.add_argument("scenario", type=file_path, help="scenario file (scenario.yaml)")
+    c.add_argument("--output", "-o", type=file_path, required=True, help="path of the recording; must not exist yet")
     c.add_argument(
         "--seed", type=nonnegative_int, metavar="N", help="seed of motion and noise; default: that of the scenario"
     )
@@ -164,11 +173,11 @@ def _add_simulate(commands: argparse._SubParsersAction[CommandParser]) -> None:
 def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "calibrate many simulated recordings, and compare their errors with the standard deviations"
     c = add_command(commands, "montecarlo", about, "icalib montecarlo scenario.yaml --runs 100 --output study")
-    c.add_argument("scenario", type=Path, help="scenario file (scenario.yaml)")
+    c.add_argument("scenario", type=file_path, help="scenario file (scenario.yaml)")
     runs = "number of runs in total, including those that the folder already has"
     c.add_argument("--runs", type=count, required=True, metavar="N", help=runs)
     folder = "folder for runs and results; the same command resumes an interrupted study"
-    c.add_argument("--output", "-o", type=Path, required=True, help=folder)
+    c.add_argument("--output", "-o", type=file_path, required=True, help=folder)
     c.add_argument(
         "--seed", type=nonnegative_int, metavar="N", help="seed of the first run; default: that of the scenario"
     )
@@ -182,7 +191,7 @@ def _add_montecarlo(commands: argparse._SubParsersAction[CommandParser]) -> None
     r = add_command(commands, "reproduce", about, "icalib reproduce --output paper")
     runs = "number of runs of each motion, of which figures show the first six; default: 6"
     r.add_argument("--runs", type=count, default=6, metavar="N", help=runs)
-    r.add_argument("--output", "-o", type=Path, required=True, help="folder for runs, figures and table")
+    r.add_argument("--output", "-o", type=file_path, required=True, help="folder for runs, figures and table")
     _add_workers(r)
     r.set_defaults(run=_reproduce)
 
@@ -196,9 +205,9 @@ def _add_fleet(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib fleet jobs.yaml --output fleet",
         "icalib fleet jobs.yaml -o fleet --workers 4 --sigma 4",
     )
-    c.add_argument("jobs", type=Path, help="YAML file of jobs")
+    c.add_argument("jobs", type=file_path, help="YAML file of jobs")
     folder = "folder for the results; finished jobs run again only if their inputs changed"
-    c.add_argument("--output", "-o", type=Path, required=True, help=folder)
+    c.add_argument("--output", "-o", type=file_path, required=True, help=folder)
     sigma = "report changes beyond N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
     _add_workers(c)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import get_args
 
-from icalib.cli.command_parser import CommandParser, add_command, add_part
+from icalib.cli.command_parser import CommandParser, add_command, add_part, file_path
 from icalib.rig import AccelUnit, GyroUnit
 
 
@@ -29,13 +29,13 @@ def _add_allan(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib allan rest.bag --output noise",
         "icalib allan rest.bag --imu /imu/data -o noise",
     )
-    c.add_argument("recording", type=Path, help="bag or folder of the recording: hours of an IMU at rest")
+    c.add_argument("recording", type=file_path, help="bag or folder of the recording: hours of an IMU at rest")
     c.add_argument("--imu", metavar="TOPIC", help="topic or table of the IMU; default: the only one")
     c.add_argument("--gyro-unit", choices=get_args(GyroUnit), help="unit of its angular rates; default: rad/s")
     accel = "unit of its accelerations; default: m/s^2, or g if gravity shows it"
     c.add_argument("--accel-unit", choices=get_args(AccelUnit), help=accel)
     c.add_argument(
-        "--output", "-o", type=Path, required=True, help="folder for plot, figures and the fields of the rig file"
+        "--output", "-o", type=file_path, required=True, help="folder for plot, figures and the fields of the rig file"
     )
     c.add_argument("--quiet", "-q", action="store_true", help="print no table")
     c.set_defaults(run=_allan)
@@ -64,11 +64,13 @@ def _add_export(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib export result --to kalibr --output kalibr",
         "icalib export result --to urdf --urdf robot.urdf -o robot.urdf --frame cam0=camera_link",
     )
-    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    c.add_argument("result", type=file_path, help="folder that a calibration was written to")
     c.add_argument("--to", required=True, choices=FORMATS, help="format of the files")
     where = f"folder for the files; for {', '.join(ONE_FILE)} the file itself"
-    c.add_argument("--output", "-o", type=Path, required=True, metavar="PATH", help=where)
-    c.add_argument("--urdf", type=Path, metavar="FILE", help="existing URDF, of which to set the origins of joints")
+    c.add_argument("--output", "-o", type=file_path, required=True, metavar="PATH", help=where)
+    c.add_argument(
+        "--urdf", type=file_path, metavar="FILE", help="existing URDF, of which to set the origins of joints"
+    )
     frame = f"name of a sensor's frame or link, where it is not the sensor's ({', '.join(FRAMED)}); may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=FRAME", help=frame)
     joint = "joint to set in --urdf; default: the one directly above the sensor's link; may be repeated"
@@ -116,12 +118,12 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib check result new.bag --sigma 4 --json check.json",
         codes=codes,
     )
-    c.add_argument("result", type=Path, help="folder that a calibration was written to")
-    c.add_argument("recording", type=Path, nargs="+", help="bag or folder of a new recording of the same rig")
+    c.add_argument("result", type=file_path, help="folder that a calibration was written to")
+    c.add_argument("recording", type=file_path, nargs="+", help="bag or folder of a new recording of the same rig")
     add_part(c)
     sigma = "ignore changes that chance explains up to N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
-    c.add_argument("--json", type=Path, metavar="FILE", help="write residuals, drift and verdict as JSON")
+    c.add_argument("--json", type=file_path, metavar="FILE", help="write residuals, drift and verdict as JSON")
     c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_check, error_code=2)
 
@@ -149,10 +151,10 @@ def _check(options: argparse.Namespace) -> int:
 def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "write a result as a rig file, with its values fixed, as priors or as guesses"
     c = add_command(commands, "rig", about, "icalib rig result --as prior --output rig.yaml")
-    c.add_argument("result", type=Path, help="folder that a calibration was written to")
+    c.add_argument("result", type=file_path, help="folder that a calibration was written to")
     how = "fixed at the values, priors with the sigma of the result, or guesses to start from"
     c.add_argument("--as", dest="treatment", required=True, choices=("fixed", "prior", "guess"), help=how)
-    c.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="rig file to write")
+    c.add_argument("--output", "-o", type=file_path, required=True, metavar="FILE", help="rig file to write")
     c.add_argument("--quiet", "-q", action="store_true", help="do not print which values could not be written as asked")
     c.set_defaults(run=_rig)
 
@@ -185,14 +187,14 @@ def _add_compare(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "icalib compare cad.urdf result --tolerance mm=2 --tolerance deg=0.2",
         codes=codes,
     )
-    c.add_argument("a", type=Path, metavar="A", help=kinds)
-    c.add_argument("b", type=Path, metavar="B", help="the same")
+    c.add_argument("a", type=file_path, metavar="A", help=kinds)
+    c.add_argument("b", type=file_path, metavar="B", help="the same")
     tolerance = "ignore differences up to this value, in deg, mm, ms, px or percent, as deg=0.1; may be repeated"
     c.add_argument("--tolerance", type=_tolerance, action="append", default=[], metavar="UNIT=VALUE", help=tolerance)
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help="ignore differences up to N sigma; default: 3")
     frame = "name in B of a sensor of A (in a URDF its link), if it differs; may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=frame)
-    c.add_argument("--json", type=Path, metavar="FILE", help="write the differences as JSON")
+    c.add_argument("--json", type=file_path, metavar="FILE", help="write the differences as JSON")
     c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_compare, error_code=2)
 
@@ -233,10 +235,10 @@ def _compare(options: argparse.Namespace) -> int:
 def _add_view(commands: argparse._SubParsersAction[CommandParser]) -> None:
     about = "show a result and its recording in 3D over time, in Rerun"
     c = add_command(commands, "view", about, "icalib view result run.bag", "icalib view result --save result.rrd")
-    c.add_argument("result", type=Path, help="folder that a calibration was written to, or the result.json in it")
-    c.add_argument("recording", type=Path, nargs="?", help="the recording of the result, or one of them")
+    c.add_argument("result", type=file_path, help="folder that a calibration was written to, or the result.json in it")
+    c.add_argument("recording", type=file_path, nargs="?", help="the recording of the result, or one of them")
     file = "write a file for Rerun; default: start its viewer"
-    c.add_argument("--save", type=Path, metavar="FILE.rrd", help=file)
+    c.add_argument("--save", type=file_path, metavar="FILE.rrd", help=file)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress, and not what is left out")
     c.set_defaults(run=_view)
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
-from icalib.cli.command_parser import CommandParser, add_command, count, examples, nonnegative_int
+from icalib.cli.command_parser import CommandParser, add_command, count, examples, file_path, nonnegative_int
 
 _MOST_IDS = 10_000  # limit; more than any tag family has
 _EXAMPLES = {
@@ -83,7 +82,7 @@ def _add_type(types: argparse._SubParsersAction[CommandParser], name: str, optio
     elif name != "checkerboard":
         one.add_argument("--border-bits", type=count, metavar="N", help="width of the tags' black border, 1 or 2")
     one.add_argument("--paper", choices=tuple(PAPERS), default="a4", help="size of the paper; default: a4")
-    one.add_argument("--output", "-o", type=Path, required=True, metavar="FILE.pdf", help="file to write")
+    one.add_argument("--output", "-o", type=file_path, required=True, metavar="FILE.pdf", help="file to write")
     one.set_defaults(run=_print_target, fields=tuple(options))
 
 
