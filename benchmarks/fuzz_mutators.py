@@ -1,10 +1,11 @@
-"""How the fuzzer changes a file: as bytes, as text, as arrays."""
+"""How the fuzzer changes a file: as bytes, as text, as arrays, or by a device in its place."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,12 +26,14 @@ _VALUES = (
 _LAUGHS = b"a: &a [x,x,x,x,x,x,x,x,x]\n" + b"".join(
     b"%c: &%c [*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c,*%c]\n" % ((98 + i, 98 + i) + (97 + i,) * 9) for i in range(12)
 )
+_BOMB = b"%s\nz: [%s]\n" % (_LAUGHS, b",".join([b"*m"] * 9))
+_DEVICES = ("/dev/zero", "/dev/null", "pipe")
 _WORDS = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63, 2**64 - 1)
 
 
 @dataclass(frozen=True)
 class Step:
-    """One change of a file: in what form it was taken (bytes, text or arrays), and what was done."""
+    """One change of a file: in what form it was taken (bytes, text, arrays or device), and what was done."""
 
     form: str
     how: str
@@ -44,7 +47,7 @@ def mutated_bytes(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]
     """What was done, and the content after it."""
     data, n = bytearray(content), max(len(content), 1)
     at = int(rng.integers(n))
-    kind = str(rng.choice(["flip", "truncate", "zero", "word", "double", "insert", "cut", "empty", "random"]))
+    kind = str(rng.choice(["flip", "truncate", "zero", "word", "double", "insert", "cut", "empty", "random", "count"]))
     length = int(rng.integers(1, 1 + min(n, 4096)))
     if kind == "flip":
         for k in rng.integers(n, size=int(rng.integers(1, 20))):
@@ -64,15 +67,30 @@ def mutated_bytes(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]
         del data[at : at + length]
     elif kind == "empty":
         data.clear()
+    elif kind == "count":
+        at = _change_count(data, rng)
     else:
         data[:] = rng.bytes(length)
     return f"{kind} at {at}", bytes(data)
 
 
+def _change_count(data: bytearray, rng: np.random.Generator) -> int:
+    """Replaces four bytes that may be a size, an offset or a count by a number that fits badly; returns their place."""
+    for at in rng.integers(max(len(data) - 4, 1), size=100).tolist():
+        value = int.from_bytes(data[at : at + 4], "little")
+        if 0 < value <= len(data):
+            others = (value - 1, value + 1, 2 * value, len(data), 2**31 - 1, 2**31, 2**32 - 1, 2**32 - value)
+            data[at : at + 4] = int(rng.choice(np.array(others, object))).to_bytes(4, "little")
+            return at
+    return 0
+
+
 def mutated_text(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
     """As `mutated_bytes`, for text: tokens, numbers and lines."""
     kind = str(
-        rng.choice(["token", "token", "number", "number", "line", "lines", "bytes", "indent", "laughs", "whole"])
+        rng.choice(
+            ["token", "token", "number", "number", "line", "lines", "bytes", "indent", "laughs", "whole", "alias"]
+        )
     )
     lines = content.split(b"\n")
     row = int(rng.integers(len(lines)))
@@ -92,6 +110,11 @@ def mutated_text(content: bytes, rng: np.random.Generator) -> tuple[str, bytes]:
         lines[row] = (b"  " + lines[row], lines[row].lstrip(), b"\t" + lines[row])[int(rng.integers(3))]
     elif kind == "laughs":
         return kind, _LAUGHS + content if rng.random() < 0.5 else content + b"\n" + _LAUGHS
+    elif kind == "alias":
+        found = list(_TOKEN.finditer(content))
+        match = found[int(rng.integers(len(found)))] if found else re.match(b"", content)
+        assert match is not None
+        return kind, _BOMB + content[: match.start()] + b"*m" + content[match.end() :]
     elif kind == "whole":
         value = _VALUES[int(rng.integers(len(_VALUES)))]
         return f"whole {value[:30]!r}", value
@@ -142,6 +165,8 @@ def mutated_arrays(content: bytes, rng: np.random.Generator) -> tuple[str, bytes
 def mutated(path: Path, rng: np.random.Generator) -> tuple[list[Step], bytes]:
     """How the content of the file is changed, once or a few times, and the content after it."""
     content, steps = path.read_bytes(), list[Step]()
+    if rng.random() < 0.02:
+        return [Step("device", str(rng.choice(_DEVICES)))], b""
     for _ in range(int(rng.choice([1, 1, 1, 2, 3]))):
         if path.suffix == ".npz" and rng.random() < 0.8 and not steps:
             form, (how, content) = "arrays", mutated_arrays(content, rng)
@@ -156,6 +181,13 @@ def mutated(path: Path, rng: np.random.Generator) -> tuple[list[Step], bytes]:
 def mutate(path: Path, rng: np.random.Generator) -> str:
     """Changes the file, and says how. Arrays of a result keep the hash that is beside them."""
     steps, content = mutated(path, rng)
+    if steps[0].form == "device":
+        path.unlink()
+        if steps[0].how == "pipe":
+            os.mkfifo(path)
+        else:
+            path.symlink_to(steps[0].how)
+        return steps[0].how
     path.write_bytes(content)
     if path.name == "result.npz":
         plain = path.with_name("result.json")

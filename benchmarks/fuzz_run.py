@@ -73,7 +73,7 @@ def run_case(case: Case, good: Path, place: Path, seconds: float) -> Found:
     shutil.copytree(good, work)
     try:
         how = mutate(work / case.file, case.rng()) if case.file else "unchanged"
-        content = (work / case.file).read_bytes() if case.file else b""
+        content = (work / case.file).read_bytes() if case.file and (work / case.file).is_file() else b""
         before = _contents(place)
         code, said, peak = _forked(work, list(case.command), seconds)
         faults = [*_faults_of_end(code, said, peak), *_faults_of_files(before, _contents(place))]
@@ -109,8 +109,10 @@ def says_no_number(said: str, content: bytes) -> bool:
 
 
 def holds_no_number(path: Path) -> bool:
-    """Whether a YAML or JSON file holds numbers that are not finite. Text may quote them."""
+    """Whether a YAML or JSON file, or a URDF, holds numbers that are not finite. Text may quote them."""
     text = path.read_text(encoding="utf-8")
+    if path.suffix == ".urdf":
+        return re.search(r'(xyz|rpy)="[^"]*(nan|inf)', text) is not None
     if not _NO_NUMBER.search(text) and "Infinity" not in text:
         return False
     waiting = [json.loads(text) if path.suffix == ".json" else yaml.safe_load(text)]
@@ -123,9 +125,11 @@ def holds_no_number(path: Path) -> bool:
 
 
 def _texts(work: Path, folder: str) -> list[Path]:
-    """What a command wrote that is YAML or JSON."""
-    found = [p for top in {folder, "made.json", "made.yaml"} for p in (work / top, *(work / top).rglob("*"))]
-    return sorted(p for p in found if p.suffix in (".yaml", ".json") and p.is_file())
+    """What a command wrote that is YAML, JSON or URDF."""
+    found = [
+        p for top in {folder, "made.json", "made.yaml", "made.urdf"} for p in (work / top, *(work / top).rglob("*"))
+    ]
+    return sorted(p for p in found if p.suffix in (".yaml", ".json", ".urdf") and p.is_file())
 
 
 def _forked(work: Path, command: list[str], seconds: float) -> tuple[int, str, int]:
