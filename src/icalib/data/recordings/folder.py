@@ -139,7 +139,7 @@ class FolderRecording(Recording):
     def _pictures(self, folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
         """Stamps [ns] and files of the images of a folder. Images with numbers in place of stamps take the stamps of
         the rows of a table, if exactly one table can provide them."""
-        if numbered := numbered_pictures(folder):
+        if numbered := numbered_pictures(folder, note):
             tables = self._tables_with_rows()
             if len(tables) == 1:
                 ((path, (rows, layout)),) = tables.items()
