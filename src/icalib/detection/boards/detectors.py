@@ -90,7 +90,7 @@ def _finder_of(target: Target) -> _Finder:
         board = _Renumbered(CheckerboardDetector(target.rows, target.cols), number)
         return _Inverted(board) if target.inverted else board
     if isinstance(target, Circles):
-        return CirclesDetector(target)
+        return _BlackOrWhite(CirclesDetector(target))
     raise RigError(f"targets of type {target.type} are not found in images; use corners as a table.")
 
 
@@ -133,6 +133,21 @@ class _Inverted:
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
         return self.detector.find_near(ImageWithQuads(255 - view.image), expected)
+
+
+@dataclass(frozen=True, eq=False)
+class _BlackOrWhite:
+    """Finds with `detector` a board that is black on white, or else white on black."""
+
+    detector: CirclesDetector
+
+    def find(self, view: ImageWithQuads) -> ImageCorners:
+        corners = self.detector.find(view)
+        return corners if len(corners.point) else self.detector.find(ImageWithQuads(255 - view.image))
+
+    def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
+        corners = self.detector.find_near(view, expected)
+        return corners if corners is not None else self.detector.find_near(ImageWithQuads(255 - view.image), expected)
 
 
 @dataclass(frozen=True, eq=False)
