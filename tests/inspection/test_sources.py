@@ -117,8 +117,3 @@ def test_topics_that_name_no_sensor(count):
     for names in itertools.combinations(PLAIN, count):
         found = find_sources([TopicInfo(name, "", PLAIN[name], 10, 0, 1) for name in names])
         assert {source.topic.name for source in found.sensors.values()} == set(names)
-
-
-def test_sensors_without_a_name_are_counted():
-    found = find_sources([TopicInfo(name, "", PLAIN[name], 10, 0, 1) for name in ("/image_raw", "/odom", "/pose")])
-    assert list(found.sensors) == ["cam0", "pose0", "pose1"]

@@ -9,7 +9,6 @@ icalib, or Kalibr's target file.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import re
 from collections.abc import Sequence
 from math import inf
@@ -145,20 +144,13 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:
-    """Unique names from the last parts of the sensors' keys, as few as make the names differ; a number is added to
-    names that stay equal."""
+    """Unique names from the last parts of the sensors' keys, as few as make the names differ. Keys may be empty."""
     names: list[str] = []
-    for length in range(1, max((len(key) for key, _ in sensors), default=0) + 1):
+    for length in range(1, max([1, *(len(key) for key, _ in sensors)]) + 1):
         names = [_name(key[-length:], kind) for key, kind in sensors]
         if len(set(names)) == len(names):
             return names
-    names = []
-    for key, kind in sensors:
-        name = _name(key, kind)
-        stem = name.rstrip("0123456789") if not key else f"{name}_"  # cam0, cam1, ... where no topic names a sensor
-        others = (f"{stem}{k}" for k in itertools.count(1))
-        names.append(name if name not in names else next(other for other in others if other not in names))
-    return names
+    return [f"{name}_{k}" if name in names[:k] else name for k, name in enumerate(names)]
 
 
 def _name(parts: Key, kind: str) -> str:
