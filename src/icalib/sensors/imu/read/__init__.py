@@ -15,15 +15,7 @@ from icalib.data.tables.table import TableFile, holds, read_table
 from icalib.data.topics import MessageType
 from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.read.halves import ImuHalf, ImuHalves, both, imu_source, one_stream, values_of
-from icalib.sensors.imu.read.table_kinds import (
-    ACCEL_TABLE,
-    GYRO_TABLE,
-    IMU,
-    IMU_ACCEL,
-    IMU_GYRO,
-    WHOLE,
-    half_layouts,
-)
+from icalib.sensors.imu.read.table_kinds import ACCEL_TABLE, GYRO_TABLE, IMU, IMU_ACCEL, IMU_GYRO, WHOLE, half_layouts
 from icalib.sensors.imu.spec import ImuSensor, TwoSources
 from icalib.sensors.imu.stream import ImuStream
 from icalib.sensors.sensor import TableLayout
