@@ -109,6 +109,14 @@ def test_columns_hold_for_both_tables(tmp_path, brief, order, columns):
     np.testing.assert_allclose(found.gyro, brief.gyro[np.isin(brief.stamps_ns, found.stamps_ns)])
 
 
+def test_tables_whose_first_column_is_no_stamp_ask_for_columns(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    columns_moved(tmp_path / "phone/gyro.csv", "xyzt")
+    found = inspect_recording(tmp_path)
+    said = " ".join(f.sentence for f in found.findings if f.severity == "problem")
+    assert "gyro.csv: its first column often falls, so it is no stamp; say which are t [ns], wx" in said
+
+
 def test_wrong_columns_of_two_tables_are_said(tmp_path, brief):
     write_tables(tmp_path / "phone", brief)
     sensor = replace(

@@ -157,9 +157,7 @@ class FolderRecording(Recording):
             tables += files_in(folder)
         plain = [(path, declared, PLAIN_TABLE) for path, declared in tables]
         kinds = [(rows_of(s.sensor_type), s) for s in self._sensors]
-        given = [
-            (path, declared, layout) for declared, s in kinds if declared for path, layout in self._layouts([s]).items()
-        ]
+        given = [(p, of, layout) for of, s in kinds if of for p, layout in self._layouts([s]).items()]
         return {path: (declared.rows, layout) for path, declared, layout in plain + given if declared.rows is not None}
 
     def _layouts(self, sensors: Sequence[Sensor]) -> dict[Path, TableLayout]:

@@ -48,8 +48,7 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
 
 def _print_table(table: Table | Text, out: Console) -> None:
     """Prints a table. If the terminal is narrower, each row is a line of text: columns would break words."""
-    wide = out.options.update(width=10_000)
-    if isinstance(table, Text) or Measurement.get(out, wide, table).maximum <= out.width:
+    if isinstance(table, Text) or Measurement.get(out, out.options.update(width=10_000), table).maximum <= out.width:
         out.print(table)
         return
     out.print(Text(str(table.title), style="bold"))
