@@ -8,8 +8,10 @@ import pytest
 
 from icalib.detection import CheckerboardDetector
 from icalib.detection.boards import checkerboard as module
+from icalib.detection.boards import diagnosis
 from icalib.detection.boards.checkerboard import shows_grid
 from icalib.detection.boards.detectors import detector_of
+from icalib.detection.boards.diagnosis import checkerboard_in
 from icalib.detection.primitives.corners import ImageCorners
 from icalib.detection.sightings import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
@@ -26,6 +28,15 @@ def board(rendering):
 @pytest.mark.parametrize(("rows", "cols"), [(5, 9), (6, 8), (5, 8), (7, 10), (9, 9), (3, 4)])
 def test_a_board_of_another_size_is_not_found(board, rows, cols):
     assert not len(CheckerboardDetector(rows, cols).detect(board[0]).point)
+
+
+def test_a_board_that_opencv_imagines_is_not_named(board, rendering, monkeypatch):
+    """OpenCV's search for any size sees boards in windows and shelves; icalib's detector has to find them, too."""
+    tags = rendering.aprilgrid(6, 6)
+    image = rendering.render(tags, rendering.homography(tags, 0.9, 30.0, 20.0, 5.0, (0.0, 0.0)))
+    assert checkerboard_in([board[0], board[0]]) == "a checkerboard of 6 x 9 inner corners"
+    monkeypatch.setattr(diagnosis, "_largest_boards", lambda image: [(3, 4)])
+    assert checkerboard_in([image, image]) == ""
 
 
 def test_tags_are_no_checkerboard(rendering):

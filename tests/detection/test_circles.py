@@ -78,6 +78,18 @@ def test_centres_are_those_of_the_projected_circles(camera, target):
     assert np.sqrt(((error - shift) ** 2).mean()) < 0.006
 
 
+@pytest.mark.parametrize("target", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
+def test_white_circles_on_black_are_found_as_well(target):
+    renderer, detector, before = Renderer(PINHOLE, Imaging(blur_px=0.8, noise=2.0)), detector_of(target), []
+    for k in range(3):  # the third is predicted by the others
+        T = pose(target, 0.5, 20.0, 30.0, 10.0 + k)
+        pixels = renderer.picture([Sheet(target)], T, np.random.default_rng(0)).pixels
+        dark, white = detector.detect(pixels), detector.detect(255 - pixels, before)
+        assert dark.kept.sum() > 0.9 * len(target.points)
+        np.testing.assert_allclose(white.uv, dark.uv, atol=1e-6)
+        before.append(white)
+
+
 NEAR = [
     (PINHOLE, Circles(4, 5, 0.05, 0.03, True), (0.25, 0.0, 0.0, 0.0)),
     (PINHOLE, Circles(4, 5, 0.05, 0.03, True), (0.45, 55.0, 200.0, 0.0)),

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import stat
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +18,8 @@ from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig.file import load_rig, load_target
 from icalib.sensors.imu.spec import class_imperfections
-from icalib.tools.inspection.draft import write_draft
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.inspection.draft import draft_rig, write_draft
 
 SIZE = (32, 24)
 K = (40.5, 41.5, 15.25, 11.75)
@@ -167,6 +170,69 @@ def test_poses_are_suggested(draft, bags):
     commented = text.split("docs/rig-file.md#pose-sensor).\n")[1].splitlines()[:4]
     path.write_text(path.read_text().replace("\n".join(commented), "\n".join("  " + c[4:] for c in commented)))
     assert [(p.name, p.topic, p.kind) for p in load_rig(path).poses] == [("robot", "/vrpn/robot/pose", "absolute")]
+
+
+def odometry(bags, level: bool, quaternion: Any, kind: str = "nav_msgs/msg/Odometry") -> list:
+    """A body that drives at 1 m/s, and nods if it is not level. quaternion: from time [s] to x, y, z, w."""
+    messages = []
+    for k in range(50):
+        stamp, t = bags.origin_ns + k * 50_000_000, 0.05 * k
+        point = bags.make("geometry_msgs/msg/Point", t, 0.0, 0.0 if level else 0.1 * np.sin(t))
+        pose = bags.make("geometry_msgs/msg/Pose", point, bags.make("geometry_msgs/msg/Quaternion", *quaternion(t)))
+        if kind.endswith("PoseStamped"):
+            messages.append(("/odom", kind, stamp, bags.make(kind, bags.header(stamp, "odom"), pose)))
+            continue
+        speed, rate = (bags.make("geometry_msgs/msg/Vector3", *v) for v in ((1.0, 0.0, 0.0), (0.0, 0.0, 0.1)))
+        twist = bags.make("geometry_msgs/msg/Twist", speed, rate)
+        twist = bags.make("geometry_msgs/msg/TwistWithCovariance", twist, np.zeros(36))
+        pose = bags.make("geometry_msgs/msg/PoseWithCovariance", pose, np.zeros(36))
+        messages.append(("/odom", kind, stamp, bags.make(kind, bags.header(stamp, "odom"), "base", pose, twist)))
+    return messages
+
+
+def yaw(t: float) -> tuple[float, ...]:
+    return 0.0, 0.0, np.sin(0.05 * t), np.cos(0.05 * t)
+
+
+def nod(t: float) -> tuple[float, ...]:
+    return np.sin(0.05 * t), 0.0, 0.0, np.cos(0.05 * t)
+
+
+def nowhere(t: float) -> tuple[float, ...]:
+    return (float("nan"),) * 4
+
+
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+@pytest.mark.parametrize(
+    ("level", "quaternion", "kind", "drafted"),
+    [
+        (True, yaw, "nav_msgs/msg/Odometry", "type: wheels topic: /odom measures: twist"),
+        (False, nod, "nav_msgs/msg/Odometry", "type: pose topic: /odom kind: relative"),
+        (True, yaw, POSE, "type: pose topic: /odom kind: relative"),
+        (False, nowhere, "nav_msgs/msg/Odometry", "type: position topic: /odom"),
+        (False, nowhere, POSE, "type: position topic: /odom"),
+        (False, lambda t: (0.0, 0.0, 0.0, 1.0), POSE, "type: position topic: /odom"),
+    ],
+)
+def test_odometry_is_drafted_as_what_it_holds(bags, brief, tmp_path, level, quaternion, kind, drafted):
+    """Level odometry is that of wheels; poses without a rotation are positions."""
+    messages = bags.imu("/imu0", brief) + bags.noise("/cam0/image_raw") + odometry(bags, level, quaternion, kind)
+    found = inspect_recording(bags.write(tmp_path / "run", messages))
+    lines = [line.strip(" #").partition("  #")[0] for line in draft_rig(found).split("pose0:\n")[1].splitlines()]
+    text = " ".join(lines)
+    assert text.startswith(drafted)
+
+
+def test_without_an_imu_odometry_follows_other_poses(bags, tmp_path):
+    """The first pose sensor gives the trajectory."""
+    tracked = [(f"/mocap{m[0]}", *m[1:]) for m in odometry(bags, False, nod, POSE)]
+    messages = odometry(bags, False, nod) + [("/tracker/pose", *m[1:]) for m in tracked]
+    text = draft_rig(inspect_recording(bags.write(tmp_path / "run", messages)))
+    assert text.index("tracker:") < text.index("pose0:")
+    kinds = re.findall(r"kind: (\w+)", text)
+    assert kinds == ["absolute", "relative"]
 
 
 @pytest.mark.parametrize(

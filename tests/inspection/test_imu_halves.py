@@ -10,11 +10,13 @@ import pytest
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
 from icalib.data.stamps.jumps import ClockJumps
-from icalib.errors import RecordingError
-from icalib.rig import ImuSensor, TwoSources
+from icalib.errors import EstimationError, RecordingError
+from icalib.rig import ImuSensor, TableLayout, TwoSources
+from icalib.sensors.imu.inspect.draft import imu_lines
 from icalib.sensors.imu.read import read_imu
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise
+from icalib.tools.allan.analysis import study_recording
 from icalib.tools.inspection import inspect_recording
 from icalib.tools.inspection.draft import draft_rig
 
@@ -84,6 +86,64 @@ def test_two_tables(tmp_path, brief):
     found, notes = joined(open_recording(tmp_path), replace(IMU, path=TwoSources("phone/gyro.csv", "phone/accel.csv")))
     assert len(notes) == 1 and "interpolated" in notes[0]
     np.testing.assert_allclose(found.gyro, brief.gyro[np.isin(brief.stamps_ns, found.stamps_ns)])
+
+
+def columns_moved(table, order: str) -> None:
+    """Writes the columns t, x, y, z in another order, without a header."""
+    rows = [line.split(",") for line in table.read_text().splitlines()[1:]]
+    table.write_text("\n".join(",".join(row["txyz".index(c)] for c in order) for row in rows))
+
+
+@pytest.mark.parametrize(
+    ("order", "columns"), [("xyzt", ["4", "1", "2", "3"]), ("zxyt", ["4", "2", "3", "1", "2", "3", "1"])]
+)
+def test_columns_hold_for_both_tables(tmp_path, brief, order, columns):
+    write_tables(tmp_path / "phone", brief)
+    for name in ("gyro", "accel"):
+        columns_moved(tmp_path / f"phone/{name}.csv", order)
+    sensor = replace(IMU, path=TwoSources("phone/gyro.csv", "phone/accel.csv"), layout=TableLayout(tuple(columns)))
+    recording = open_recording(tmp_path)
+    recording.use_layouts([sensor])
+    assert [t.first_ns for t in recording.topics()] == [brief.stamps_ns[0], brief.stamps_ns[4] + OFFSET]
+    found, _ = joined(recording, sensor)
+    np.testing.assert_allclose(found.gyro, brief.gyro[np.isin(brief.stamps_ns, found.stamps_ns)])
+
+
+def test_tables_whose_first_column_is_no_stamp_ask_for_columns(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    columns_moved(tmp_path / "phone/gyro.csv", "xyzt")
+    found = inspect_recording(tmp_path)
+    said = " ".join(f.sentence for f in found.findings if f.severity == "problem")
+    assert "gyro.csv: its first column often falls, so it is no stamp; say which are t [ns], wx" in said
+
+
+def test_wrong_columns_of_two_tables_are_said(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    sensor = replace(
+        IMU, path=TwoSources("phone/gyro.csv", "phone/accel.csv"), layout=TableLayout(("t [ns]", "x", "y"))
+    )
+    with pytest.raises(RecordingError, match=r"gyro.csv: `columns` in the rig file needs 4 names"):
+        joined(open_recording(tmp_path), sensor)
+
+
+@pytest.mark.parametrize("names", [("gyro", "accel"), ("rec_GYRO", "rec_ACCL"), ("gyroscope", "accelerometer")])
+@pytest.mark.parametrize("folder", ["phone", "."])
+def test_inspect_drafts_both_tables(tmp_path, brief, names, folder):
+    write_tables(tmp_path / "made", brief)
+    (tmp_path / "run" / folder).mkdir(parents=True)
+    for was, name in zip(("gyro", "accel"), names, strict=True):
+        (tmp_path / "made" / f"{was}.csv").rename(tmp_path / "run" / folder / f"{name}.csv")
+    found = inspect_recording(tmp_path / "run")
+    assert list(found.sources.of("imu")) == ["imu0"] and not found.facts["imu0"].problem
+    gyro, accel = ((f"{folder}/" if folder != "." else "") + f"{name}.csv" for name in names)
+    lines = "\n".join(imu_lines(found, found.sources.of("imu")))
+    assert f"path: {{gyro: {gyro}, accel: {accel}}}" in lines
+
+
+def test_allan_takes_both_tables(tmp_path, brief):
+    write_tables(tmp_path / "phone", brief)
+    with pytest.raises(EstimationError, match="at rest"):  # it is waved about
+        study_recording(tmp_path)
 
 
 def test_clocks_that_have_nothing_in_common(tmp_path, brief):

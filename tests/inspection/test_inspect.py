@@ -328,7 +328,19 @@ class TestStreams:
         pixels = np.random.default_rng(0).integers(0, 255, (30, 4, 4), dtype=np.uint8)
         slow = [bags.image("/c/image", bags.origin_ns + k * 60 * STEP, p) for k, p in enumerate(pixels)]
         found = inspect_recording(bags.write(tmp_path / "slow", slow + bags.imu("/imu0", brief)))
-        assert any("c takes 0.33 images per second, too few" in s for s in sentences(found, "problem"))
+        (problem,) = sentences(found, "problem")
+        assert "c takes 0.33 images per second, too few" in problem and "remove imu0 from the rig file" in problem
+
+    def test_stills_beside_the_joints_of_an_arm(self, bags, tmp_path):
+        pixels = np.random.default_rng(0).integers(0, 255, (12, 4, 4), dtype=np.uint8)
+        messages = [bags.image("/c/image", bags.origin_ns + k * 100 * STEP, p) for k, p in enumerate(pixels)]
+        kind, empty = "sensor_msgs/msg/JointState", np.zeros(0)
+        for k in range(100):
+            stamp = bags.origin_ns + k * 10 * STEP
+            joints = bags.make(kind, bags.header(stamp, ""), ["elbow"], np.array([0.1 * k]), empty, empty)
+            messages.append(("/joint_states", kind, stamp, joints))
+        found = inspect_recording(bags.write(tmp_path / "run", messages))
+        assert not sentences(found, "problem") and "90 s" not in str(found.findings)
 
 
 class TestNoRecording:

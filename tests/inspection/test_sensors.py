@@ -145,3 +145,31 @@ def test_still_images_need_be_few(tmp_path, count, severity):
     said = [f.severity for f in found.findings if f"{count} images" in f.sentence or f"images ({count})" in f.sentence]
     assert said == ([severity] if severity else [])
     assert (found.verdict == "no") == (severity == "problem")
+
+
+def test_tables_at_the_top_of_a_folder(everything, tmp_path):
+    """Poses as TUM text of any name, fixes, two tables of an IMU; clouds of single files are named, and not read."""
+    run = recording(everything, tmp_path / "run", "imu0 mocap0")
+    rows = np.loadtxt(run / "mocap0/poses.csv", delimiter=",")
+    rows[:, 0] *= 1e-9
+    np.savetxt(tmp_path / "run/groundtruth.txt", rows, fmt="%.9f")
+    fixes = np.column_stack(
+        [rows[:, 0] * 1e9, 48.0 + 1e-5 * rows[:, 1:2], 11.0 + 1e-5 * rows[:, 2:3], 500.0 + rows[:, 3]]
+    )
+    np.savetxt(run / "gps.csv", fixes, fmt="%d,%.9f,%.9f,%.4f", header="time_ns,latitude,longitude,height", comments="")
+    readings = np.loadtxt(run / "imu0/data.csv", delimiter=",")
+    for name, at in (("Gyroscope", [0, 1, 2, 3]), ("Accelerometer", [0, 4, 5, 6])):
+        np.savetxt(run / f"{name}.csv", readings[:, at], fmt="%d,%.9f,%.9f,%.9f")
+    for name in ("imu0/data.csv", "mocap0/poses.csv"):
+        (run / name).unlink()
+    (run / "clouds").mkdir()
+    (run / "notes.txt").write_text("recorded on a Monday, with all sensors\n")
+    for k in range(3):
+        (run / f"clouds/{k}.pcd").write_text("# .PCD v0.7\n")
+    found = inspect_recording(run)
+    topics = {s.topic.name: s.topic.kind for s in found.streams}
+    tables = {"Gyroscope.csv": "imu", "Accelerometer.csv": "imu", "groundtruth.txt": "pose", "gps.csv": "position"}
+    assert topics == tables | {"clouds/*.pcd": ""}
+    assert list(found.sources.of("imu")) == ["imu0"] and found.verdict != "no", found.findings
+    assert any("clouds/*.pcd holds clouds that have no stamps; record" in f.sentence for f in found.findings)
+    assert "path: {gyro: Gyroscope.csv, accel: Accelerometer.csv}" in draft_rig(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 
 import pytest
@@ -97,3 +98,22 @@ def test_images_and_corners_of_one_camera():
 def test_names_that_no_part_tells_apart():
     found = find_sources(topics("/a-/image_raw", "/a_/image_raw"))
     assert len(found.sensors) == 2
+
+
+PLAIN = {
+    "/image_raw": "image",
+    "/data": "imu",
+    "/odom": "odometry",
+    "/pose": "pose",
+    "/fix": "navsat",
+    "/point": "point",
+    "/points": "points",
+    "/joint_states": "joints",
+}
+
+
+@pytest.mark.parametrize("count", [1, 2, len(PLAIN)])
+def test_topics_that_name_no_sensor(count):
+    for names in itertools.combinations(PLAIN, count):
+        found = find_sources([TopicInfo(name, "", PLAIN[name], 10, 0, 1) for name in names])
+        assert {source.topic.name for source in found.sensors.values()} == set(names)

@@ -37,6 +37,11 @@ def test_names_that_are_no_stamps(tmp_path, truth, write):
     root = write.euroc(tmp_path, truth)
     (root / "mav0/cam0/data.csv").unlink()
     (root / "mav0/cam0/data/left_1.png").touch()
+    recording = open_recording(root)
+    assert [f.stamp_ns for f in recording.images("cam0")] == truth.image_stamps
+    assert "1 of 13 images were left out, the first left_1.png" in " ".join(recording.notes())
+    for k in range(2, 14):
+        (root / f"mav0/cam0/data/left_{k}.png").touch()
     sentence = complaint(lambda: list(open_recording(root).images("cam0")))
     assert "cam0 has no data.csv, and the name of left_1.png is not a stamp in ns" in sentence
 

@@ -114,6 +114,42 @@ def test_single_pictures_that_are_odd_are_left_out_and_named(tmp_path):
         assert f"{reason} were left out, the first {name}.png." in notes
 
 
+@pytest.mark.parametrize(
+    ("names", "odd"),
+    [
+        ("IMG_000{}.png", "preview.png"),
+        ("IMG_000{}.png", "99999999999999999999.png"),
+        ("170000000{}000000000.png", "preview.png"),
+        ("170000000{}000000000.png", "preview2.png"),
+    ],
+)
+def test_a_picture_without_a_number_is_left_out_and_named(tmp_path, names, odd):
+    for i in range(4):
+        picture(tmp_path / names.format(i), 10 + i)
+    picture(tmp_path / odd, 1)
+    recording = open_recording(tmp_path)
+    assert [(t.name, t.count) for t in recording.topics()] == [(".", 4)]
+    assert [grey for _, grey in greys(recording, "cam0")] == [10, 11, 12, 13]
+    assert f"1 of 5 images were left out, the first {odd}: its name" in " ".join(recording.notes())
+
+
+def test_a_picture_without_a_number_is_of_no_pattern(tmp_path):
+    for i in range(4):
+        picture(tmp_path / f"left{i}.png", 10 + i)
+        picture(tmp_path / f"right{i}.png", 30 + i)
+    picture(tmp_path / "preview.png", 1)
+    assert [t.name for t in open_recording(tmp_path).topics()] == ["left*.png", "right*.png"]
+
+
+def test_a_picture_without_a_stamp_beside_kalibrs_and_numbered_ones(tmp_path):
+    for i in range(4):
+        picture(tmp_path / "cam0" / "data" / f"{50_000_000 * i}.png", 10 + i)
+    picture(tmp_path / "cam0" / "data" / "preview.png", 1)
+    recording = FolderRecording(tmp_path)
+    assert len(greys(recording, "cam0")) == 4
+    assert "1 of 5 images were left out, the first preview.png" in " ".join(recording.notes())
+
+
 def test_an_imu_needs_a_clock(tmp_path):
     picture(tmp_path / "1.png", 1)
     with pytest.raises(RecordingError, match="Remove imu0 from the rig file"):

@@ -33,41 +33,56 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     """Stamps [ns] and files of the images of a camera folder, in the order of data.csv; without one, sorted by stamp.
 
     The images are in the subfolder `data`, or in `folder` itself if their names are dates. Empty without images. note:
-    called if files have another suffix than data.csv says. Raises RecordingError naming an unreadable line.
+    called if files have another suffix than data.csv says, and on a few names that are none of it. Raises RecordingError naming an unreadable line.
     """
     data = folder / "data"
     paths = pictures_in(data)
     if not paths:
-        return stamped_by_name(pictures_in(folder)) or []
+        return stamped_by_name(pictures_in(folder), (), note) or []
     table = folder / "data.csv"
     if table.is_file():
         return _with_other_endings(_listed(table, data), paths, table, note)
-    if named := stamped_by_name(paths):
+    if named := stamped_by_name(paths, (), note):
         return named
-    unnamed = next((p for p in paths if not (p.stem.isdecimal() and int(p.stem) < 2**63)), None)
-    if unnamed:
+    numbered = [p for p in paths if p.stem.isdecimal() and int(p.stem) < 2**63]
+    if not are_most(numbered, paths, note):
+        unnamed = next(p for p in paths if p not in numbered)
         raise RecordingError(
             f"{folder} has no data.csv, and the name of {unnamed.name} is not a stamp in ns; write data.csv with "
             "lines t [ns],file name."
         )
-    return sorted((int(p.stem), p) for p in paths)
+    return sorted((int(p.stem), p) for p in numbered)
 
 
 def pictures_in(folder: Path) -> list[Path]:
     return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
 
 
-def stamped_by_name(files: Sequence[Path], names: Sequence[str] = ()) -> list[tuple[int, Path]] | None:
-    """Stamps [ns] and files, sorted by stamp, if all names are times since 1970 in the same unit; else None.
+def stamped_by_name(
+    files: Sequence[Path], names: Sequence[str] = (), note: Note = ignore
+) -> list[tuple[int, Path]] | None:
+    """Stamps [ns] and files, sorted by stamp, if most names are times since 1970 in the same unit; else None.
 
-    names: the part of each name that contains the stamp; default: the name without suffix.
+    names: the part of each name that contains the stamp; default: the name without suffix. note: see `are_most`.
     """
-    matches = [_STAMPED.fullmatch(name) for name in names or [p.stem for p in files]]
-    texts = [m["stamp"] for m in matches if m]
-    unit = unit_by_date([float(text) for text in texts]) if len(texts) == len(files) else None
-    if unit is None or not files:
+    matches = [(p, _STAMPED.fullmatch(name)) for p, name in zip(files, names or [p.stem for p in files], strict=True)]
+    texts = {p: match["stamp"] for p, match in matches if match}
+    unit = unit_by_date([float(text) for text in texts.values()]) if texts else None
+    if unit is None or not are_most(list(texts), files, note):
         return None
-    return sorted((nanoseconds(text, unit), p) for text, p in zip(texts, files, strict=True))
+    return sorted((nanoseconds(text, unit), p) for p, text in texts.items())
+
+
+def are_most(named: Sequence[Path], files: Sequence[Path], note: Note = ignore) -> bool:
+    """Whether more than half of the images `files` are `named`, by number or stamp. The others are then left out, with
+    a note."""
+    odd = sorted(set(files) - set(named))
+    if odd and len(named) > len(odd):
+        note(
+            f"{odd[0].parent}: {len(odd)} of {len(files)} images were left out, the first {odd[0].name}: its name has "
+            "neither a number nor a stamp since 1970, as the others have."
+        )
+    return len(named) > len(odd)
 
 
 def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iterator[Payload]:

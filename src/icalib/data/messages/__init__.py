@@ -75,6 +75,17 @@ def _pose_of(message: Any) -> Any:
     return message.pose.pose if hasattr(message.pose, "pose") else message.pose
 
 
+def poses_and_twists(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, np.ndarray]:
+    """Unchecked poses (N, 7) x, y, z [m] and quaternion x, y, z, w, and twists (N, 6) [m/s, rad/s] of a topic of poses
+    or odometry; twists are zero where messages have none. Raises RecordingError as `BagRecording.messages`."""
+    _, messages = all_messages(bag, topic, kind)
+    poses = [_pose_of(m) for m in messages]
+    twists = [m.twist.twist if hasattr(m, "twist") else None for m in messages]
+    rows = [(*_xyz(p.position), *_xyz(p.orientation), p.orientation.w) for p in poses]
+    speeds = [(*_xyz(t.linear), *_xyz(t.angular)) if t else (0.0,) * 6 for t in twists]
+    return np.array(rows).reshape(-1, 7), np.array(speeds).reshape(-1, 6)
+
+
 def read_twists(bag: HasMessages, topic: str) -> TwistStream:
     """All TwistStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
     stamps_ns, messages = all_messages(bag, topic, "twist")

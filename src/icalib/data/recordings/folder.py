@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
 from functools import cached_property
 from pathlib import Path
 from typing import final
@@ -25,7 +27,7 @@ from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window
 from icalib.data.tables.numbered import numbered_pictures, stamped_by_rows
 from icalib.data.tables.table import StampsOfRows, TableFile, files_in, named_tables, rows_of
-from icalib.data.topics import TopicInfo, choose_topic, find_topic
+from icalib.data.topics import TopicInfo, choose_topic, find_topic, type_not_read
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
 from icalib.sensors.sensor import Sensor
@@ -57,8 +59,9 @@ class FolderRecording(Recording):
                 if images is None or path.name not in _OF_IMAGES:
                     topics.append(self._info(path, f"{folder.name}/{path.name.removesuffix('.gz')}", declared))
         for base in self._bases():
-            topics += [self._info(path, path.name, declared) for path, declared in named_tables(base)]
-        return (*topics, *self._videos)
+            for path, declared in _top_tables(base).items():
+                topics.append(self._info(path, path.name.removesuffix(".gz"), declared))
+        return (*topics, *self._videos, *self._unread)
 
     def stamps(self, topic: str) -> np.ndarray:
         stamps_ns = self._all_stamps(topic)
@@ -74,8 +77,8 @@ class FolderRecording(Recording):
             folder = next(p for base in self._bases() if (p := base / chosen.name).is_dir())
             return np.array([stamp_ns for stamp_ns, _ in self._pictures(folder)], np.int64)
         path = self._locate(chosen.name)
-        tables = named_tables(path.parent) if path.parent in self._bases() else files_in(path.parent)
-        return self._stamps_of(path, dict(tables)[path])
+        tables = _top_tables(path.parent) if path.parent in self._bases() else dict(files_in(path.parent))
+        return self._stamps_of(path, tables[path])
 
     def image_topic(self, sensor: str, given: str | None) -> str:
         return choose_topic(str(self.root), self.image_topics(), sensor, given, "image").name
@@ -139,7 +142,7 @@ class FolderRecording(Recording):
     def _pictures(self, folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
         """Stamps [ns] and files of the images of a folder. Images with numbers in place of stamps take the stamps of
         the rows of a table, if exactly one table can provide them."""
-        if numbered := numbered_pictures(folder):
+        if numbered := numbered_pictures(folder, note):
             tables = self._tables_with_rows()
             if len(tables) == 1:
                 ((path, (rows, layout)),) = tables.items()
@@ -149,26 +152,31 @@ class FolderRecording(Recording):
     def _tables_with_rows(self) -> dict[Path, tuple[StampsOfRows, TableLayout]]:
         """Tables whose rows can provide stamps for images, detected ones and those of the rig file: the function that
         reads the stamps, and the layout."""
-        tables = [named for base in self._bases() for named in named_tables(base)]
+        tables = [table for base in self._bases() for table in _top_tables(base).items()]
         for folder in (p for base in self._bases() for p in base.iterdir() if p.is_dir()):
             tables += files_in(folder)
         plain = [(path, declared, PLAIN_TABLE) for path, declared in tables]
-        given = [(path, declared, layout) for path, (declared, layout) in self._layouts().items()]
+        kinds = [(rows_of(s.sensor_type), s) for s in self._sensors]
+        given = [(p, of, layout) for of, s in kinds if of for p, layout in self._layouts([s]).items()]
         return {path: (declared.rows, layout) for path, declared, layout in plain + given if declared.rows is not None}
 
-    def _layouts(self) -> dict[Path, tuple[TableFile, TableLayout]]:
-        """As `_tables_with_rows`, for tables of the sensors of `use_layouts`: declaration and layout."""
-        tables = [(s.sensor_type, getattr(s, "path", ""), getattr(s, "layout", PLAIN_TABLE)) for s in self._sensors]
-        layouts = [(self.find(path), rows, layout) for kind, path, layout in tables if (rows := rows_of(kind))]
-        return {path: (declared, layout) for path, declared, layout in layouts if path is not None}
+    def _layouts(self, sensors: Sequence[Sensor]) -> dict[Path, TableLayout]:
+        """Layouts of the tables of `sensors`, those of `use_layouts`."""
+        given = [(getattr(s, "path", ""), getattr(s, "layout", PLAIN_TABLE)) for s in sensors]
+        paths = [(path, layout) for of, layout in given for path in ((of,) if isinstance(of, str) else astuple(of))]
+        return {table: layout for path, layout in paths if (table := self.find(path)) is not None}
 
     def _stamps_of(self, path: Path, declared: TableFile) -> np.ndarray:
         """(N,) int64 ns: stamps of a table."""
-        declared, layout = self._layouts().get(path, (declared, PLAIN_TABLE))
-        return declared.stamps(path, layout)
+        return declared.stamps(path, self._layouts(self._sensors).get(path, PLAIN_TABLE))
 
     def _info(self, path: Path, name: str, declared: TableFile) -> TopicInfo:
-        stamps_ns = self._stamps_of(path, declared)
+        """The topic of a table. If it cannot be read as it is, its count is 1, so that later reading raises the
+        error."""
+        try:
+            stamps_ns = self._stamps_of(path, declared)
+        except RecordingError:
+            return TopicInfo(name, declared.type, declared.kind, 1, None, None)
         first, last = int(stamps_ns.min()), int(stamps_ns.max())
         return TopicInfo(name, declared.type, declared.kind, len(stamps_ns), first, last)
 
@@ -176,6 +184,17 @@ class FolderRecording(Recording):
     def _videos(self) -> tuple[TopicInfo, ...]:
         files = {p: None for base in self._bases() for p in videos_in(base)}
         return tuple(video_topic(p, str(p.relative_to(self.root))) for p in files)
+
+    @cached_property
+    def _unread(self) -> tuple[TopicInfo, ...]:
+        """Files of other sensors that icalib cannot read (`UnreadType`), by folder and ending."""
+        files = [p for base in self._bases() for pattern in ("*", "*/*") for p in base.glob(pattern)]
+        counts = Counter(str(p.relative_to(self.root).parent / f"*{p.suffix.lower()}") for p in files if p.suffix)
+        return tuple(
+            TopicInfo(name, f"{Path(name).suffix} files", "", count, None, None)
+            for name, count in sorted(counts.items())
+            if type_not_read(f"{Path(name).suffix} files")
+        )
 
     def _locate(self, path_hint: str, field: str = "path") -> Path:
         if table := self.find(path_hint):
@@ -192,3 +211,8 @@ class FolderRecording(Recording):
             return "the folder holds no files"
         more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
         return f"it holds {', '.join(names[:_MAX_LISTED])}{more}"
+
+
+def _top_tables(folder: Path) -> dict[Path, TableFile]:
+    """Tables directly in the folder of the recording: declared files, and tables with the header of one."""
+    return {**dict(files_in(folder)), **dict(named_tables(folder))}

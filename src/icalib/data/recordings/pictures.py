@@ -14,7 +14,7 @@ from typing import final
 import numpy as np
 
 from icalib.data.images.image_checks import checked_payloads
-from icalib.data.images.image_files import SUFFIXES, file_payloads, pictures_in, stamped_by_name
+from icalib.data.images.image_files import SUFFIXES, are_most, file_payloads, pictures_in, stamped_by_name
 from icalib.data.images.images import Payload
 from icalib.data.recordings.base import Recording
 from icalib.data.stamps.window import WHOLE_RECORDING, Window
@@ -113,19 +113,32 @@ class PictureFolder(Recording):
             keys = [p.stem for p in paths]
         if not paths:
             raise RecordingError(f"{self.root} has no images {topic}; correct `topic` of the camera in the rig file.")
-        images = stamped_by_name(paths, keys)
+        images = stamped_by_name(paths, keys, self.note)
         what = "number" if images is None else "stamp"
         if images is None and not self.window.is_all:
             raise RecordingError(
                 f"{self.root} holds images without timestamps, so --from and --to cannot be used; leave them out."
             )
-        images = images or sorted((_number(key, p), p) for key, p in zip(keys, paths, strict=True))
+        images = images or self._numbered(dict(zip(paths, keys, strict=True)))
         for (a, first), (b, second) in zip(images, images[1:], strict=False):
             if a == b:
                 raise RecordingError(
                     f"{first} and {second.name} have the same {what}, {a}; give each image of a camera its own."
                 )
         return [(at * (APART_NS if what == "number" else 1), path) for at, path in images]
+
+    def _numbered(self, keys: dict[Path, str]) -> list[tuple[int, Path]]:
+        """Number and file of each image, sorted. Raises RecordingError if most of the names `keys` have none."""
+        numbers = {path: digits for path, key in keys.items() if (digits := re.findall(r"\d+", key))}
+        images = sorted((n, path) for path, digits in numbers.items() if (n := int(digits[-1])) <= MOST)
+        named = [path for _, path in images]
+        if not are_most(named, list(keys), self.note):
+            unnamed = next(path for path in keys if path not in named)
+            raise RecordingError(
+                f"the name of {unnamed} has neither a number nor a stamp since 1970; name images 0001.jpg, 0002.jpg, "
+                "..., with the same number for those taken together."
+            )
+        return images
 
 
 def _topics(root: Path) -> list[str]:
@@ -136,7 +149,8 @@ def _topics(root: Path) -> list[str]:
 def _patterns_of_cameras(root: Path, folder: str) -> list[str]:
     """Topics of `folder`: file patterns, if it mixes the images of several cameras with shared numbers; else `folder`;
     empty without images."""
-    paths = pictures_in(root / folder)
+    pictures = pictures_in(root / folder)
+    paths = [path for path in pictures if re.search(r"\d", path.stem)]
     # The number is the last or the second last in the names, whichever gives fewer patterns.
     patterns = min((_patterns(paths, place) for place in (-1, -2)), key=len)
     numbers = [number for group in patterns.values() for number in group]
@@ -144,7 +158,7 @@ def _patterns_of_cameras(root: Path, folder: str) -> list[str]:
     alike = len(patterns) > 1 and min(map(len, patterns.values())) > 1
     if alike and sum(map(len, patterns.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
         return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in patterns)
-    return [folder] if paths else []
+    return [folder] if pictures else []
 
 
 def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
@@ -159,13 +173,3 @@ def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
         else:
             patterns.setdefault(path.name, set()).add(0)
     return patterns
-
-
-def _number(key: str, path: Path) -> int:
-    groups = re.findall(r"\d+", key)
-    if not groups or int(groups[-1]) > MOST:
-        raise RecordingError(
-            f"the name of {path} has neither a number nor a stamp since 1970; name images 0001.jpg, 0002.jpg, "
-            "..., with the same number for those taken together."
-        )
-    return int(groups[-1])

@@ -12,30 +12,29 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.images.image_checks import Note
-from icalib.data.images.image_files import pictures_in, stamped_by_name
+from icalib.data.images.image_checks import Note, ignore
+from icalib.data.images.image_files import are_most, pictures_in, stamped_by_name
 from icalib.data.stamps.clocks import is_rate
 from icalib.errors import RecordingError
 
 _IMAGE_RATE_HZ = (1e-3, 1000.0)  # names are stamps only if they make an image rate within this range
 
 
-def numbered_pictures(folder: Path) -> list[tuple[int, Path]]:
+def numbered_pictures(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     """Number and file of each image in `folder` or its subfolder `data`, sorted by number.
 
     The number is the last one in the file name. Empty without images, if they have stamps (`data.csv`, or names that
-    are stamps), or if a name has no number.
+    are stamps), or if most names have no number. note: see `are_most`.
     """
     data = pictures_in(folder / "data")
     files = data or pictures_in(folder)
     if not files or (data and (folder / "data.csv").is_file()) or stamped_by_name(files) is not None:
         return []
-    groups = [re.findall(r"\d+", path.stem) for path in files]
-    if not all(groups):
+    images = sorted((int(digits[-1]), path) for path in files if (digits := re.findall(r"\d+", path.stem)))
+    if not are_most([path for _, path in images], files, note):
         return []
-    images = sorted((int(digits[-1]), path) for digits, path in zip(groups, files, strict=True))
     numbers = np.array([number for number, _ in images], dtype=object)
-    stamps = data and all(path.stem.isdecimal() for path in files) and numbers[-1] < 2**63
+    stamps = data and all(path.stem.isdecimal() for _, path in images) and numbers[-1] < 2**63
     return [] if stamps and is_rate(numbers.astype(np.int64), *_IMAGE_RATE_HZ) else images
 
 

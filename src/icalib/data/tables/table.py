@@ -28,6 +28,7 @@ from icalib.sensors import SENSOR_KINDS, facet
 _GZIP_MAGIC = b"\x1f\x8b"
 _SEPARATORS = (",", ";", "\t", None)  # None: whitespace
 _MOST_UNREADABLE = 0.1  # largest share of unreadable lines; with more, the file has another format
+_MOST_FALLING = 0.2  # largest share of steps back in a column of stamps; readings that do not move fall in half
 _NS = 1_000_000_000
 _MOST_SECONDS = 2**62 // _NS
 _INTEGER_NS = -1  # in place of a power of ten: stamps must be whole nanoseconds
@@ -79,6 +80,9 @@ def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, n
             f"{path}: the stamps are read as {UNIT_WORDS[unit]}, as their rate shows; `time_unit` in the rig file may "
             "say otherwise."
         )
+    falls = np.diff(table.integers[:, 0]) < 0
+    if not (text.header or layout.columns) and falls.sum() > _MOST_FALLING * len(falls):
+        raise RecordingError(f"{path}: its first column often falls, so it is no stamp; {_advice(kind)}.")
     for sentence in table.notes:
         note(sentence)
     return table
@@ -231,7 +235,7 @@ def _places(text: _Text, kind: TableKind, layout: TableLayout) -> np.ndarray:
     place = places_by_name(kind, text.header)
     if place is not None:
         return place
-    advice = f"say which are {', '.join(kind.names)} by `columns: [...]` of the sensor in the rig file"
+    advice = _advice(kind)
     if text.columns > wanted and text.header and not kind.more:
         raise RecordingError(f"{text.path}: its columns are {', '.join(text.header)}; {advice}.")
     if contradicts(kind, text.header):
@@ -239,6 +243,10 @@ def _places(text: _Text, kind: TableKind, layout: TableLayout) -> np.ndarray:
     place = np.full(max(wanted, text.columns) if kind.more else wanted, LEFT_OUT, np.int64)
     place[:wanted] = np.arange(wanted)
     return place
+
+
+def _advice(kind: TableKind) -> str:
+    return f"say which are {', '.join(kind.names)} by `columns: [...]` of the sensor in the rig file"
 
 
 def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table:

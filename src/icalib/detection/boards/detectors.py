@@ -90,7 +90,7 @@ def _finder_of(target: Target) -> _Finder:
         board = _Renumbered(CheckerboardDetector(target.rows, target.cols), number)
         return _Inverted(board) if target.inverted else board
     if isinstance(target, Circles):
-        return CirclesDetector(target)
+        return _Inverted(CirclesDetector(target), either=True)
     raise RigError(f"targets of type {target.type} are not found in images; use corners as a table.")
 
 
@@ -124,15 +124,18 @@ class _SceneDetector:
 
 @dataclass(frozen=True, eq=False)
 class _Inverted:
-    """Finds with `detector` a board that is white on black."""
+    """Finds with `detector` a board that is white on black; either: in the image as it is, or else white on black."""
 
-    detector: CharucoDetector | _Renumbered
+    detector: CharucoDetector | CirclesDetector | _Renumbered
+    either: bool = False
 
     def find(self, view: ImageWithQuads) -> ImageCorners:
-        return self.detector.find(ImageWithQuads(255 - view.image))
+        corners = self.detector.find(view) if self.either else no_corners()
+        return corners if len(corners.point) else self.detector.find(ImageWithQuads(255 - view.image))
 
     def find_near(self, view: ImageWithQuads, expected: PredictedCorners) -> ImageCorners | None:
-        return self.detector.find_near(ImageWithQuads(255 - view.image), expected)
+        corners = self.detector.find_near(view, expected) if self.either else None
+        return corners or self.detector.find_near(ImageWithQuads(255 - view.image), expected)
 
 
 @dataclass(frozen=True, eq=False)

@@ -202,9 +202,8 @@ def other_size(images: Iterable[np.ndarray], board: Checkerboard) -> str:
 
 def checkerboard_in(images: Sequence[np.ndarray]) -> str:
     """Text with the size of the largest checkerboard that at least two of the images (h, w) uint8 show; "" if there is
-    none."""
-    sizes = [size for image in images for size in _largest_boards(image)]
-    counts = {size: sizes.count(size) for size in set(sizes)}
+    none. OpenCV sees small boards in windows, shelves and leaves; those that the detector finds as well count."""
+    counts = {size: _count(images, size) for size in {size for image in images for size in _largest_boards(image)}}
     if max(counts.values(), default=0) < _LEAST_IMAGES:
         return ""
     rows, cols = max(counts, key=lambda size: (counts[size], size))
@@ -221,7 +220,7 @@ def _largest_boards(image: np.ndarray) -> list[tuple[int, int]]:
     return [(min(meta.shape), max(meta.shape))] if success else []
 
 
-def _count(images: list[np.ndarray], size: tuple[int, int]) -> int:
+def _count(images: Sequence[np.ndarray], size: tuple[int, int]) -> int:
     """Number of images with a checkerboard of `size` (rows, cols) inner corners."""
     detector = CheckerboardDetector(*size)
     return sum(bool(detector.detect(image).kept.any()) for image in images)

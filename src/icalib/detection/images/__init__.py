@@ -108,7 +108,7 @@ def _one_thread_in_opencv() -> Iterator[None]:
         cv2.setNumThreads(before)
 
 
-DETECTOR_VERSION = 8  # of the detectors and of the file format; raise it with each change that changes corners
+DETECTOR_VERSION = 9  # of the detectors and of the file format; raise it with each change that changes corners
 _FIELDS = ("point", "uv", "sigma", "blur", "verdict", "edges")
 
 

@@ -12,8 +12,8 @@ from icalib.errors import RecordingError
 from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import FramePair, Inspection
-from icalib.tools.inspection.kinds import KindInspector, inertial
+from icalib.tools.inspection.facts import FramePair, Inspection, SensorSource
+from icalib.tools.inspection.kinds import Key, KindInspector, inertial
 
 
 class PoseInspector(KindInspector):
@@ -30,6 +30,10 @@ class PoseInspector(KindInspector):
     )
     moves_alone: ClassVar[bool] = True
     frame_topics: ClassVar[tuple[str, ...]] = (TRANSFORMS,)
+
+    def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, SensorSource]]:
+        """See `KindInspector`; odometry comes last, as the first sensor gives the trajectory without an IMU."""
+        return super().sources(sorted(topics, key=_drifts))
 
     def frames(self, recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
         """Pairs of frames of /tf and similar topics. Both results are empty for recordings that are not bags."""
@@ -50,8 +54,8 @@ class PoseInspector(KindInspector):
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """The `kind` line of the draft. Without an IMU the first pose sensor gives the trajectory, so it must be
         absolute."""
-        drifts = topic.kind == "odometry" or "odom" in topic.name
-        yield f"kind: {'relative' if drifts and inertial(inspection) else 'absolute'}"
+        leads = not inertial(inspection) and name == next(iter(inspection.sources.of(self.sensor.sensor_type)))
+        yield f"kind: {'relative' if _drifts(topic) and not leads else 'absolute'}"
 
     def more_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         """Draft lines of a pose sensor from transforms, if any transform changes. Its frames are the ends of the chain
@@ -68,6 +72,10 @@ class PoseInspector(KindInspector):
         place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
         for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
             yield f"{'' if active else '# '}{line}"
+
+
+def _drifts(topic: TopicInfo) -> bool:
+    return topic.kind == "odometry" or "odom" in topic.name
 
 
 INSPECTOR = PoseInspector()

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from typing import ClassVar
 
+import numpy as np
+
+from icalib.data.messages import poses_and_twists
+from icalib.data.recordings import Recording
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import Sensor
+from icalib.tools.inspection.facts import SensorSource, Sources
 from icalib.tools.inspection.kinds import KindInspector
 
 
@@ -22,6 +27,17 @@ class PositionInspector(KindInspector):
         "Positions of something on the robot: an antenna, a prism, a tag? Then remove the #;",
         "the lever arm and the clock are calibrated (docs/rig-file.md#position-sensor).",
     )
+
+    def joined(self, recording: Recording, sources: Sources) -> Sources:
+        """The sources; poses of a bag whose rotation is unknown or never changes are positions."""
+        return sources.with_kind("position", lambda source: source.kind == "pose" and _points(recording, source))
+
+
+def _points(recording: Recording, source: SensorSource) -> bool:
+    pose, _ = poses_and_twists(recording, source.topic.name, source.topic.kind)
+    good = np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 1e-3
+    moves, turns = ((part != part[:1]).any() for part in (pose[:, :3], pose[:, 3:]))
+    return bool(2 * good.sum() < len(good) or (moves and not turns))
 
 
 INSPECTOR = PositionInspector()

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from icalib.data.measurements import ImuStream
-from icalib.data.recordings import BagRecording, Recording, TopicInfo, open_recording
+from icalib.data.recordings import Recording, open_recording
 from icalib.data.stamps.jumps import ClockJumps
 from icalib.data.stamps.ordered import true_runs
 from icalib.data.topics import find_topic, listing
 from icalib.errors import EstimationError, RecordingError
-from icalib.rig import AccelUnit, GyroUnit, ImuSensor
+from icalib.rig import AccelUnit, GyroUnit, ImuSensor, TwoSources
 from icalib.sensors.imu.read import read_imu
-from icalib.sensors.imu.read.halves import pair_of
+from icalib.sensors.imu.read.halves import both, pair_of
 from icalib.sensors.imu.read.units import DEGREE
 from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.allan.fit import AllanFit, bands_of_all, fit_noise, pooled
@@ -84,9 +84,9 @@ def study_recording(
     Raises RecordingError if the readings are missing or wrong, EstimationError if the IMU was not at rest for 10 s.
     """
     recording: Recording = open_recording(path)
-    topic = _imu_topic(str(path), recording, imu)
+    name, source = _imu_source(str(path), recording, imu)
     sensor = ImuSensor(
-        topic.name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name, accel_unit=accel_unit, gyro_unit=gyro_unit
+        name, source, class_noise(DEFAULT_CLASS), topic=source, accel_unit=accel_unit, gyro_unit=gyro_unit
     )
     jumps = ClockJumps()
     stream, notes = read_imu(recording, sensor, jumps.cut)
@@ -108,22 +108,24 @@ def study_imu(imu: ImuStream, where: str, notes: tuple[str, ...] = ()) -> ImuNoi
     return ImuNoiseStudy(imu.name, where, still.seconds, still.period, gyro, accel, warnings, notes)
 
 
-def _imu_topic(where: str, recording: Recording, name: str | None) -> TopicInfo:
-    """The topic or table `name`, else the only one with readings of an IMU. If gyroscope and accelerometer have a
-    topic each, one of the two. Raises RecordingError with a list of the topics."""
+def _imu_source(where: str, recording: Recording, name: str | None) -> tuple[str, str | TwoSources]:
+    """Name and source: the topic or table `name`, else the only one with readings of an IMU. If gyroscope and
+    accelerometer have a topic or table each, both. Raises RecordingError with a list of the topics."""
     topics = recording.topics()
+    pair = pair_of(recording, topics)
     if name is not None:
         topic = find_topic(where, topics, name)
         if topic.kind != "imu" or not topic.count:
             raise RecordingError(f"{where}: {name} holds no readings of an IMU; {listing(topics)}; correct --imu.")
-        return topic
+        return name, pair if pair and topic.name in both(pair) else topic.name
     imus = [t for t in topics if t.kind == "imu" and t.count]
     if not imus:
         raise RecordingError(f"{where} has no readings of an IMU; {listing(topics)}; record one at rest.")
-    pair = len(imus) == 2 and isinstance(recording, BagRecording) and pair_of(recording, topics)
-    if len(imus) > 1 and not pair:
+    if len(imus) == 2 and pair:
+        return pair.gyro, pair
+    if len(imus) > 1:
         raise RecordingError(f"{where} has several IMUs, {', '.join(t.name for t in imus)}; give one as --imu.")
-    return imus[0]
+    return imus[0].name, imus[0].name
 
 
 def _sensor_noise(kind: str, unit: str, stretches: list[np.ndarray], period: float) -> SensorNoise:

@@ -180,7 +180,7 @@ def _short(text: str) -> str:
 def _instability(sensor: SensorNoise, axis: int) -> str:
     if axis >= len(AXES):
         return ""
-    below = "below " if sensor.open[axis] else ""
+    below = "< " if sensor.open[axis] else ""
     return _short(f"{below}{sensor.instability[axis]:.1e} at {sensor.instability_tau[axis]:.0f} s")
 
 

@@ -144,10 +144,9 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:
-    """Unique names from the last parts of the sensors' keys, as few as make the names differ."""
-    longest = max((len(key) for key, _ in sensors), default=1)
+    """Unique names from the last parts of the sensors' keys, as few as make the names differ. Keys may be empty."""
     names: list[str] = []
-    for length in range(1, longest + 1):
+    for length in range(1, max([1, *(len(key) for key, _ in sensors)]) + 1):
         names = [_name(key[-length:], kind) for key, kind in sensors]
         if len(set(names)) == len(names):
             return names

@@ -9,6 +9,8 @@ import dataclasses
 from typing import Any
 
 from rich.console import Console
+from rich.measure import Measurement
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -34,14 +36,26 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
     for f in inspection.findings:
         out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
     out.print()
-    out.print(streams_table(inspection))
     kinds = inspectors().values()
-    tables = [table for kind in kinds for table in kind.readings_tables(inspection)]
+    tables: list[Table | Text] = [streams_table(inspection)]
+    tables += [table for kind in kinds for table in kind.readings_tables(inspection)]
     tables += [frames_table(inspection)] if inspection.frames else []
     for table in (*tables, *(table for kind in kinds for table in kind.target_tables(inspection))):
-        out.print(table)
+        _print_table(table, out)
     for note in (*inspection.notes, *(note for kind in kinds for note in kind.notes(inspection))):
         out.print(Text(f"Note: {note}"))
+
+
+def _print_table(table: Table | Text, out: Console) -> None:
+    """Prints a table. If the terminal is narrower, each row is a line of text: columns would break words."""
+    if isinstance(table, Text) or Measurement.get(out, out.options.update(width=10_000), table).maximum <= out.width:
+        out.print(table)
+        return
+    out.print(Text(str(table.title), style="bold"))
+    for cells in zip(*(column.cells for column in table.columns), strict=True):
+        named = [f"{c.header} {cell}" for c, cell in zip(table.columns[1:], cells[1:], strict=True) if str(cell)]
+        out.print(Padding(Text(f"{cells[0]}: ".lstrip(": ") + ", ".join(named)), (0, 0, 0, 2)))
+    out.print(Text(str(table.caption or "")))
 
 
 def streams_table(inspection: Inspection) -> Table:
@@ -78,8 +92,7 @@ def plain_table(title: str, headers: tuple[str, ...], right: int, caption: str) 
     """An empty table; right: number of the first column that is aligned to the right."""
     table = Table(title=title, caption=caption, caption_justify="left", title_justify="left")
     for k, header in enumerate(headers):
-        # The first column, the name of the row, does not wrap.
-        table.add_column(Text(header), justify="right" if k >= right else "left", overflow="fold", no_wrap=k == 0)
+        table.add_column(Text(header), justify="right" if k >= right else "left")
     return table
 
 

@@ -5,14 +5,16 @@ Rates, gaps and jitter of stamps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from icalib.data.recordings import TopicInfo
 from icalib.data.stamps.jumps import longest_part
+from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.kalibr import KalibrFiles
@@ -93,6 +95,15 @@ class Sources:
 
     sensors: Mapping[str, SensorSource]
     left_out: Mapping[str, str]
+
+    def with_kind(self, kind: str, chosen: Callable[[SensorSource], bool]) -> Sources:
+        """These sources; those that are `chosen` by what they hold are of the sensor type `kind`. Unreadable ones stay
+        what they are."""
+        sensors = dict(self.sensors)
+        for name, source in self.sensors.items():
+            with suppress(RecordingError):
+                sensors[name] = replace(source, kind=kind) if chosen(source) else source
+        return replace(self, sensors=sensors)
 
     def of(self, kind: str) -> dict[str, Any]:
         """Sources of the sensors of one kind, by name; their class is that of the kind."""

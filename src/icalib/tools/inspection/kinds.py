@@ -75,7 +75,7 @@ class KindInspector:
         return {}
 
     def joined(self, recording: Recording, sources: Sources) -> Sources:
-        """The sources, in which topics that are parts of one sensor are joined."""
+        """The sources, in which topics that are parts of one sensor are joined, or belong to this kind by content."""
         return sources
 
     def read(self, recording: Recording, name: str, source: Any) -> tuple[StreamFacts, Any]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from icalib.data.recordings import TopicInfo
 from icalib.sensors.camera.inspect.facts import TargetView, camera_sources, camera_views, patterns, without_target
-from icalib.tools.inspection.facts import Finding, Inspection, imu_timing, overlap_s, words_on_gaps
+from icalib.tools.inspection.facts import Finding, Inspection, Timing, imu_timing, overlap_s, words_on_gaps
 from icalib.tools.inspection.kinds import inertial, rolls
 
 LEAST_SHARE = 0.3  # share of images with the target
@@ -47,30 +47,35 @@ def _unfit(inspection: Inspection, name: str) -> str:
         return stream.problem
     if view is not None and view.problem:
         return view.problem
-    fewest, advice = _fewest_images(inspection)
+    fewest, advice = _fewest_images(inspection, timing)
+    if inertial(inspection) and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
+        return (
+            f"{name} takes {timing.rate_hz:.2g} images per second, too few to follow its motion; record 10 to 30, or "
+            f"remove {' and '.join(inertial(inspection))} from the rig file to calibrate the lens from stills."
+        )
     if timing.count < fewest:
         return f"{name} has {timing.count} images, too few; {advice}."
-    if inertial(inspection) and timing.rate_hz and timing.rate_hz < SLOWEST_IMAGES_HZ:
-        return f"{name} takes {timing.rate_hz:.2g} images per second, too few to follow its motion; record 10 to 30."
     if view is not None and view.seen < fewest:
         return f"{name} sees the target in {view.seen} images, too few; keep it in view, and {advice}."
     return ""
 
 
-def _fewest_images(inspection: Inspection) -> tuple[int, str]:
-    """Number of images that `calibrate` requires of a camera, and advice on how to record them."""
-    if inertial(inspection) or rolls(inspection):
+def _fewest_images(inspection: Inspection, timing: Timing) -> tuple[int, str]:
+    """Number of images that `calibrate` requires of a camera, and advice on how to record them. Images that are seconds
+    apart are stills, also beside joints, which may be those of an arm that stops."""
+    stills = timing.rate_hz is None or timing.rate_hz < SLOWEST_IMAGES_HZ
+    if inertial(inspection) or (rolls(inspection) and not stills):
         return FEWEST_IMAGES, "record for 30 to 90 s, with 10 to 30 images per second"
     return FEWEST_STILLS, "take 20 to 60 images of the target from all sides"
 
 
 def _few_stills(inspection: Inspection) -> Iterator[Finding]:
     """Warnings on cameras alone with enough images for a calibration, but too few for a good one."""
-    if _fewest_images(inspection)[0] != FEWEST_STILLS:
-        return
     for name, camera in camera_sources(inspection).items():
         timing, view = inspection.stream(camera.topic).timing, inspection.facts[name].view
-        count = view.seen if view is not None and not view.problem else timing.count if timing else 0
+        if timing is None or _fewest_images(inspection, timing)[0] != FEWEST_STILLS:
+            continue
+        count = view.seen if view is not None and not view.problem else timing.count
         if FEWEST_STILLS <= count < FEW_STILLS:
             yield Finding(
                 "warning",

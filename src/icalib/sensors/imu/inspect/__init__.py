@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 from rich.table import Table
 
-from icalib.data.recordings import BagRecording, Recording, TopicInfo
+from icalib.data.recordings import Recording, TopicInfo
 from icalib.errors import RecordingError
 from icalib.sensors.imu.inspect import findings
 from icalib.sensors.imu.inspect.draft import imu_lines
@@ -40,11 +40,11 @@ class ImuInspector(KindInspector):
         return ((topic_key(t), ImuSource(self.sensor.sensor_type, t)) for t in topics if t.kind in self.topic_kinds)
 
     def joined(self, recording: Recording, sources: Sources) -> Sources:
-        """The sources, in which the two topics of one IMU (gyroscope, accelerometer) are joined to one IMU. Its name is
-        the first free one of imu0, imu1, ..."""
+        """The sources, in which the two topics or tables of one IMU (gyroscope, accelerometer) are joined to one IMU.
+        Its name is the first free one of imu0, imu1, ..."""
         imus = sources.of(self.sensor.sensor_type)
         topics = tuple(imu.topic for imu in imus.values())
-        pair = pair_of(recording, topics) if isinstance(recording, BagRecording) else None
+        pair = pair_of(recording, topics)
         if pair is None:
             return sources
         gyro = next(t for t in topics if t.name == pair.gyro)

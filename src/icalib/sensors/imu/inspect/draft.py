@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from icalib.sensors.imu.inspect.facts import ImuSource
+from icalib.sensors.imu.read.table_kinds import CARRIED
 from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES, ImuNoise, TwoSources, class_noise, class_of_noise
 from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kalibr import KalibrImu
@@ -56,6 +57,7 @@ def _kalibr_imu(inspection: Inspection, topic: str) -> KalibrImu | None:
 
 
 def _places(halves: TwoSources, kind: str, frame: str) -> str:
-    """The `topic` line of an IMU whose gyroscope and accelerometer have a topic each."""
+    """The `topic` or `path` line of an IMU whose gyroscope and accelerometer have a topic or table each."""
+    field = "path" if kind in CARRIED else "topic"
     topics = f"{{gyro: {name_text(halves.gyro)}, accel: {name_text(halves.accel)}}}"
-    return f"    topic: {topics}  # {comment(kind)}" + in_frame(frame)
+    return f"    {field}: {topics}  # {comment(kind)}" + in_frame(frame)

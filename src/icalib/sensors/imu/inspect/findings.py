@@ -19,7 +19,6 @@ FASTEST_RAD_S = 12.0  # largest rate of a rig that is turned by hand
 DEGREE = np.pi / 180.0
 LIKELIER = 0.7  # rates are in deg/s if the spread of gravity is less than this times that for rad/s,
 EXPLAINED = 0.95  # and less than this times the spread without rotation
-CONTRARY = 1.2  # a spread of more than this times that without rotation shows that the rates contradict gravity
 SHORT_S = 20.0  # shortest recording without a warning
 
 
@@ -46,12 +45,6 @@ def readings(inspection: Inspection) -> Iterator[Finding]:
             "set gyro_unit: deg/s in the rig file.",
         )
         return
-    if radians > CONTRARY * none:
-        yield Finding(
-            "warning",
-            f"{name}: the rotation of gravity in the accelerometer contradicts the angular rates; check that "
-            "they are in rad/s, and that the driver gives both sensors in the same axes.",
-        )
     if fast > FASTEST_RAD_S:
         yield Finding(
             "warning",

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from icalib.data.recordings.base import Cut, Reading, ReadStream, Recording
 from icalib.data.stamps.jumps import ClockJumps
+from icalib.data.tables.columns import TableKind
 from icalib.data.tables.table import TableFile, holds, read_table
 from icalib.data.topics import MessageType
 from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.read.halves import ImuHalf, ImuHalves, both, imu_source, one_stream, values_of
-from icalib.sensors.imu.read.table_kinds import IMU, IMU_ACCEL, IMU_GYRO
+from icalib.sensors.imu.read.table_kinds import ACCEL_TABLE, GYRO_TABLE, IMU, IMU_ACCEL, IMU_GYRO, WHOLE, half_layouts
 from icalib.sensors.imu.spec import ImuSensor, TwoSources
 from icalib.sensors.imu.stream import ImuStream
 from icalib.sensors.sensor import TableLayout
@@ -21,16 +23,16 @@ from icalib.sensors.sensor import TableLayout
 MESSAGES = (MessageType("sensor_msgs/msg/Imu", "imu"),)
 
 
-def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
-    del layout
-    return read_table(path, IMU).integers[:, 0].copy()
+def _stamps(kind: TableKind, half: int | None, path: Path, layout: TableLayout) -> np.ndarray:
+    """(N,) int64 stamps [ns] of a table; half: 0 and 1, of the gyroscope and of the accelerometer alone."""
+    return read_table(path, kind, layout if half is None else half_layouts(layout)[half]).integers[:, 0].copy()
 
 
-def _is_one(path: Path) -> bool:
-    return holds(path, IMU)
-
-
-TABLES = (TableFile("data.csv", "table of readings", "imu", _stamps, _is_one, IMU),)
+TABLES = (
+    TableFile("data.csv", WHOLE, "imu", partial(_stamps, IMU, None), partial(holds, kind=IMU), IMU),
+    TableFile("*[Gg][Yy][Rr]*.csv", GYRO_TABLE, "imu", partial(_stamps, IMU_GYRO, 0), partial(holds, kind=IMU_GYRO)),
+    TableFile("*[Aa][Cc][Cc]*.csv", ACCEL_TABLE, "imu", partial(_stamps, IMU_ACCEL, 1), partial(holds, kind=IMU_ACCEL)),
+)
 
 
 def read(recording: Recording, sensors: Sequence[ImuSensor], reading: Reading) -> list[ReadStream]:
@@ -83,8 +85,8 @@ def _from_messages(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHa
 
 def _from_tables(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalves:
     if isinstance(sensor.path, TwoSources):
-        layout, halves = TableLayout(time_unit=sensor.layout.time_unit), []
-        for name, kind in ((sensor.path.gyro, IMU_GYRO), (sensor.path.accel, IMU_ACCEL)):
+        kinds, layouts, halves = (IMU_GYRO, IMU_ACCEL), half_layouts(sensor.layout), []
+        for name, kind, layout in zip(both(sensor.path), kinds, layouts, strict=True):
             path = recording.table(sensor, name)
             table = read_table(path, kind, layout, recording.note)
             half = ImuHalf(sensor.name, table.integers[:, 0].copy(), table.decimals)

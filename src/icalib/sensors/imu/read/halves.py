@@ -14,7 +14,7 @@ from icalib.data.stamps.ordered import kept_readings
 from icalib.data.topics import TopicInfo, choose_topic
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor, TwoSources
-from icalib.sensors.imu.read.table_kinds import RATE_HZ
+from icalib.sensors.imu.read.table_kinds import CARRIED, RATE_HZ
 
 _LOOKED_AT = 50  # readings that tell which sensor a topic carries; a driver leaves the other at zero or NaN
 _LEAST_COMMON_S = 1.0  # time in which both sensors ran
@@ -66,10 +66,10 @@ def imu_source(where: str, bag: HasImuMessages, topics: Sequence[TopicInfo], sen
 
 
 def pair_of(bag: HasImuMessages, topics: Sequence[TopicInfo]) -> TwoSources | None:
-    """The two topics of an IMU if exactly one topic has only gyroscope readings and exactly one has only accelerometer
-    readings; otherwise None."""
-    names = [t.name for t in topics if t.kind == "imu" and t.count]
-    carried = {name: _carried(bag, name) for name in names} if len(names) > 1 else {}
+    """The two topics or tables of an IMU if exactly one has only gyroscope readings and exactly one has only
+    accelerometer readings; otherwise None."""
+    imus = [t for t in topics if t.kind == "imu" and t.count]
+    carried = {t.name: CARRIED.get(t.type) or _carried(bag, t.name) for t in imus} if len(imus) > 1 else {}
     gyros, accels = ([name for name, what in carried.items() if what == half] for half in ("gyro", "accel"))
     return TwoSources(gyros[0], accels[0]) if len(gyros) == len(accels) == 1 else None
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from icalib.data.tables.columns import STAMP, TableKind, vector_names
+from icalib.sensors.sensor import TableLayout
 
 RATE_HZ = (10.0, 20_000.0)
 GYRO = r"w|omega|g|gyro|gyr|gyros|gyroscope|angular_(velocity|vel|rate)|ang_?vel|rotation_rate|w_rs_s"
@@ -24,3 +27,17 @@ IMU_GYRO, IMU_ACCEL = (
     )
     for decimals, known in ((IMU.decimals[:3], IMU.known[1:4]), (IMU.decimals[3:], IMU.known[4:]))
 )
+
+# Types of tables, as of `TopicInfo`, and what each has.
+WHOLE, GYRO_TABLE, ACCEL_TABLE = "table of readings", "table of angular rates", "table of accelerations"
+CARRIED = {WHOLE: "both", GYRO_TABLE: "gyro", ACCEL_TABLE: "accel"}
+
+
+def half_layouts(layout: TableLayout) -> tuple[TableLayout, TableLayout]:
+    """Layouts of separate tables of gyroscope and accelerometer. Four `columns` hold for both; seven are in the order
+    of a single table. A stamp in two columns makes one more."""
+    columns, stamps = layout.columns, len(layout.columns) - 6
+    if stamps < 1:
+        return layout, layout
+    accel = columns[:stamps] + columns[stamps + 3 :]
+    return replace(layout, columns=columns[: stamps + 3]), replace(layout, columns=accel)

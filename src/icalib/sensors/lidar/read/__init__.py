@@ -30,6 +30,12 @@ UNREAD = (
         "raw packets of a LiDAR; replay the recording with the LiDAR's driver, and record the sensor_msgs/PointCloud2 "
         "that it sends",
     ),
+    UnreadType(
+        r"\.(pcd|ply|las|laz) files",
+        "points",
+        "clouds that have no stamps; record the driver's sensor_msgs/PointCloud2 in a bag, or write scans.npz "
+        "(docs/recordings.md)",
+    ),
 )
 
 

@@ -56,10 +56,21 @@ def _is_one(path: Path) -> bool:
     return is_tum_text(path) or holds(path, POSE_TABLE)
 
 
+def _is_tum(path: Path) -> bool:
+    """Whether a text file of any other name is TUM text."""
+    if path.stem == "poses":
+        return False
+    try:
+        return len(read_pose_file(path.stem, path).stamps_ns) > 1
+    except RecordingError:
+        return False
+
+
 TABLES = (
     TableFile("poses.csv", "table of poses", "pose", _stamps, _is_one, POSE_TABLE, stamps_by_row),
     TableFile("poses.tum", "table of poses", "pose", _stamps, rows=stamps_by_row),
     TableFile("poses.txt", "table of poses", "pose", _stamps, rows=stamps_by_row),
+    *(TableFile(f"*{ending}", "table of poses", "pose", _stamps, _is_tum) for ending in (".tum", ".txt")),
 )
 
 

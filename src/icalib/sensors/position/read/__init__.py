@@ -7,13 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from icalib.data.recordings.base import Reading, ReadStream, Recording
 from icalib.data.stamps.ordered import kept_readings, true_runs
-from icalib.data.tables.table import TableFile
+from icalib.data.tables.table import TableFile, named
 from icalib.data.topics import MessageType, TopicInfo
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import east_north_up, latitude_longitude
@@ -21,6 +22,7 @@ from icalib.sensors.position.read.outliers import single_wrong, steps
 from icalib.sensors.position.read.readings import (
     AS_RECORDED,
     FIX_RATES_HZ,
+    GEODETIC,
     LocalFrame,
     PositionReadings,
     about_first,
@@ -54,6 +56,7 @@ def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
 
 TABLES = (
     TableFile("positions.csv", "table of positions", "position", _stamps),
+    TableFile("*[Gg][NnPp][Ss]*.csv", "table of positions", "position", _stamps, partial(named, kind=GEODETIC)),
     TableFile(f"*{SUFFIX}", "solution of RTKLIB", "position", _stamps),
 )
 
