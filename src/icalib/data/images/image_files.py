@@ -33,7 +33,8 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     """Stamps [ns] and files of the images of a camera folder, in the order of data.csv; without one, sorted by stamp.
 
     The images are in the subfolder `data`, or in `folder` itself if their names are dates. Empty without images. note:
-    called if files have another suffix than data.csv says, and on a few names that are none of it. Raises RecordingError naming an unreadable line.
+    called if files have another suffix than data.csv says, and on a few names that are none of it. Raises
+    RecordingError naming an unreadable line.
     """
     data = folder / "data"
     paths = pictures_in(data)
