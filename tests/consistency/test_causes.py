@@ -56,22 +56,33 @@ def test_a_clean_recording_has_no_reason(simulation):
     assert calibrated(simulation, simulation.measurements).reasons == ()
 
 
-@pytest.mark.parametrize("ppm", [300.0, -100.0])
-def test_a_clock_that_drifts(simulation, ppm):
+@pytest.mark.parametrize(
+    ("ppm", "verdict"), [(300.0, "not usable"), (-100.0, "usable with care"), (60.0, "usable with care")]
+)
+def test_a_clock_that_drifts(simulation, ppm, verdict):
     """The rate is that of the drift to a tenth; stamps that run fast need an offset that falls."""
     seconds = simulation.measurements.cameras[0].seconds
     result = calibrated(simulation, stamped(simulation.measurements, 1e-6 * ppm * seconds))
     words = result.reasons[0]
-    match = re.search(r"the clock of (\w+) drifts against the others by about ([+-]\d+) ppm", words)
-    assert match is not None and result.verdict == "not usable", result.reasons
-    sign = -1.0 if match[1] == "cam0" else 1.0  # which of two clocks it is does not show
-    assert float(match[2]) == pytest.approx(sign * ppm, rel=0.15)
+    match = re.search(r"the clock of cam0 .*drifts against the others by about ([+-]\d+) ppm", words)
+    assert match is not None and result.verdict == verdict, result.reasons
+    assert float(match[1]) == pytest.approx(-ppm, rel=0.15)
+
+
+def test_a_clock_that_two_cameras_share(simulation):
+    """Neither drifts against the other, both against the IMU."""
+    late = [
+        replace(c, stamps_ns=c.stamps_ns + np.round(3e5 * c.seconds).astype(np.int64))
+        for c in simulation.measurements.cameras
+    ]
+    result = calibrated(simulation, simulation.measurements.with_streams(*late))
+    assert "the clock of cam0 and cam1 drifts against the others by about -3" in result.reasons[0], result.reasons
 
 
 def test_a_clock_that_jumps(simulation):
     seconds = simulation.measurements.cameras[0].seconds
     result = calibrated(simulation, stamped(simulation.measurements, np.where(seconds > 9.4, 0.004, 0.0)))
-    assert re.search(r"the time offset of cam\d changes by about [+-](3|4)\S* ms near 9\.\d", result.reasons[0]), (
+    assert re.search(r"the time offset of cam0 changes by about [+-](3|4)\S* ms near 9\.\d", result.reasons[0]), (
         result.reasons
     )
 

@@ -15,13 +15,14 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.noise_size import NoiseFit
 from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.residual_statistics.parameter_changes import Change, changes, heterogeneity
+from icalib.estimate.residual_statistics.parameter_changes import Change, changes, scatter
 from icalib.estimate.residual_statistics.segments import Segments
 from icalib.observability.cause import Cause
 from icalib.result import SensorFit
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
 from icalib.sensors import call_all_kinds
+from icalib.sensors.sensor import TIME_OFFSET
 from icalib.validation.disturbance import Disturbance, disturbance
 
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
@@ -31,8 +32,8 @@ EXPLAINS = 0.1
 # 0.99, less if it is far from a segment boundary. On EuRoC, where lens and board do not follow the model, the best
 # change gains 0.04.
 CHANGES = 0.25
-ALIKE = 0.8  # share of the best gain above which another group is named, too, such as focal length for distance
-SIGNIFICANT = 25.0  # gain in chi^2 for each parameter: five standard deviations, because many boundaries are tried
+ALIKE = 0.8  # share of the best gain from which on another change explains the data as well
+LARGE = 2.0  # tolerances; a constant value is wrong by half of a change
 INERTIAL = ("gyroscope", "accelerometer")
 
 
@@ -89,12 +90,30 @@ def changing(
     if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
     if segments is not None and (misfit.fits or scattering):
-        breaks = changes(segments, inputs.sensors)
-        if breaks and breaks[0].gain > max(CHANGES * heterogeneity(segments), SIGNIFICANT * breaks[0].count):
-            alike = [c for c in breaks if c.key[0] == breaks[0].key[0] and c.gain > ALIKE * breaks[0].gain]
-            causes.append(Cause(_change_words(alike, segments, timeline), breaks[0].gain, True))
+        causes += _change(inputs, segments, misfit, timeline)
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
+
+
+def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
+    """The change that explains clearly more than all others, if there is one. Two that explain as much are named
+    together if they are the same change, seen from either sensor, or changes of one sensor."""
+    by_gain, spread = changes(segments, inputs.sensors), scatter(segments)
+    if not by_gain or by_gain[0].gain < CHANGES * spread.gain or not spread.exceeded_by(by_gain[0]):
+        return
+    best = by_gain[0]
+    alike = [c for c in by_gain if c.gain > ALIKE * best.gain]
+    kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
+    if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
+        words = _change_words(alike, segments, timeline)
+        share = f" This explains {min(best.gain / spread.gain, 1.0):.0%} of what varies over the recording."
+        yield Cause(words + share, best.gain, misfit.is_grave or _is_large(best, segments))
+
+
+def _is_large(c: Change, segments: Segments) -> bool:
+    """Whether a parameter changes by more than LARGE tolerances."""
+    tolerance = segments.problem.tolerance[segments.problem.layout.columns(c.sensors[0], c.name)]
+    return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
 
 
 def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
@@ -139,41 +158,47 @@ def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
 
 
 def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> str:
-    """A sentence on a change of one sensor. alike: changes that explain about as much, the best first."""
-    best, sensor = alike[0], alike[0].key[0]
+    """A sentence on a change. alike: changes that explain about as much, the best first."""
+    best = alike[0]
+    others = list(dict.fromkeys(" and ".join(c.sensors) for c in alike if c.sensors != best.sensors))
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
-    if best.key[1] == "time_offset":
-        return _clock_words(best, segments, when, timeline)
-    what = " or ".join(_changed(c, segments) for c in alike if c.key[1] != "time_offset")
-    lens = any(c.key[1] == "intrinsics" for c in alike)
+    if best.name == TIME_OFFSET.name:
+        return _clock_words(best, others, segments, when, timeline)
+    what = " or ".join(_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name)
+    lens = any(c.name == "intrinsics" for c in alike)
     off = " Switch off autofocus, zoom and image stabilisation." if lens else ""
+    instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
     return (
-        f"{sensor} changes {when}: {what}.{off} Fasten all mounts and record again"
+        f"{_names(best)} changes {when}: {what}{instead}.{off} Fasten all mounts and record again"
         f"{_apart(best, timeline, ', or calibrate the recording before or after that alone')}."
     )
 
 
+def _names(c: Change) -> str:
+    return " and ".join(c.sensors)
+
+
 def _changed(c: Change, segments: Segments) -> str:
     """Text with the size of a change of a lens or of extrinsics."""
-    over = float(np.ptp(segments.state.seconds[segments.ends])) if c.pattern == "drift" else 1.0
-    if c.key[1] == "intrinsics":
-        return f"its lens by up to {over * np.abs(c.value).max():.2g} px"
-    turn, move = _sizes(segments, c, over)
+    if c.name == "intrinsics":
+        return f"its lens by up to {np.abs(c.value).max():.2g} px"
+    turn, move = _sizes(segments, c)
     return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
 
 
-def _clock_words(c: Change, segments: Segments, when: str, timeline: Timeline) -> str:
-    """A sentence on a time offset that drifts or jumps."""
+def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> str:
+    """A sentence on a time offset that drifts or jumps. others: clocks that explain as much."""
+    instead = f" (or that of {', or of '.join(others)} the opposite way)" if others else ""
     if c.pattern == "drift":
         span = float(np.ptp(segments.state.seconds[segments.ends]))
         return (
-            f"the clock of {c.key[0]} drifts against the others by about {1e6 * c.value[0]:+.0f} ppm, "
-            f"{1e3 * span * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
+            f"the clock of {_names(c)}{instead} drifts against the others by about {1e6 * c.value[0] / span:+.0f} ppm, "
+            f"{1e3 * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
             "and record again."
         )
     return (
-        f"the time offset of {c.key[0]} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock jumped, or "
-        f"stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}."
+        f"the time offset of {_names(c)}{instead} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock "
+        f"jumped, or stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}."
     )
 
 
@@ -185,12 +210,11 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
-def _sizes(segments: Segments, c: Change, over: float) -> tuple[float, float]:
-    """Angle [rad] and distance [m] of a change of rotation, translation or both. over: duration [s] of a drift, 1 for a
-    step."""
+def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
+    """Angle [rad] and distance [m] of a change of rotation, translation or both."""
     layout, n = segments.problem.layout, 0
     sizes = {"rotation": 0.0, "translation": 0.0}
     for name in sizes:
-        if layout.is_free(c.key[0], name) and n + 3 <= len(c.value):
-            sizes[name], n = over * float(np.linalg.norm(c.value[n : n + 3])), n + 3
+        if layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
+            sizes[name], n = float(np.linalg.norm(c.value[n : n + 3])), n + 3
     return sizes["rotation"], sizes["translation"]
