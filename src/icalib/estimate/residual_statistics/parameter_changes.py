@@ -75,14 +75,14 @@ class Scatter:
 def changes(parts: Segments, sensors: Sequence[Sensor]) -> tuple[Change, ...]:
     """The pattern with the largest gain for each candidate of `sensors`, sorted by decreasing gain. Target, planes and
     IMU are the reference for the others; the clock of the IMU is that which all others share."""
-    form, found = _Form.of(parts), []
+    form, best_changes = _Form.of(parts), []
     for candidate in _candidates(parts, sensors):
         by_pattern: dict[Pattern, Change] = {}
         for change in _tested(parts, form, candidate):
             by_pattern[change.pattern] = max(by_pattern.get(change.pattern, change), change, key=lambda c: c.gain)
         best, second, *_ = sorted(by_pattern.values(), key=lambda c: -c.gain)
-        found.append(replace(best, rival=second.gain))
-    return tuple(sorted(found, key=lambda c: -c.gain))
+        best_changes.append(replace(best, rival=second.gain))
+    return tuple(sorted(best_changes, key=lambda c: -c.gain))
 
 
 def scatter(parts: Segments) -> Scatter:
@@ -177,6 +177,6 @@ class _Form:
         """The change of a candidate by `pattern` (G,), estimated together with a common step of all parameters."""
         D = candidate.directions
         cross = D.T @ np.einsum("g,gij->ij", pattern, self.information) @ self.root
-        own = D.T @ np.einsum("g,gij->ij", pattern**2, self.information) @ D
+        changed = D.T @ np.einsum("g,gij->ij", pattern**2, self.information) @ D
         gradient = D.T @ (pattern @ self.gradient) - cross @ (self.root.T @ self.gradient.sum(axis=0))
-        return _Solved.of(own - cross @ cross.T, gradient)
+        return _Solved.of(changed - cross @ cross.T, gradient)
