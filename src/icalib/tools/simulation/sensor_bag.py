@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.files import write_text
 from icalib.data.measurements import ImuStream
 from icalib.errors import RigError
 from icalib.tools.simulation.images.filming import Film
 from icalib.tools.simulation.images.rendering import Imaging
 from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagWriter
+from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
 from icalib.tools.simulation.tables import atomic_output, write_truth
@@ -26,8 +28,8 @@ _AT_A_TIME = 10_000  # readings that are converted to Python numbers at once, wh
 def write_sensors(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes an MCAP bag and its truth to the new folder `path`, atomically. If `path` ends with .bag, it is a ROS 1
-    bag without truth.
+    """Writes an MCAP bag, its truth and its rig file to the new folder `path`, atomically. If `path` ends with .bag,
+    it is a ROS 1 bag without them.
 
     Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
     or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
@@ -46,6 +48,7 @@ def write_sensors(
                 progress(1.0 - (last_ns - at_ns) / span_ns)
         if not ros1:
             write_truth(simulation, seed, place)
+            write_text(place / "rig.yaml", rig_text(simulation.scenario, topics))
     return notes
 
 

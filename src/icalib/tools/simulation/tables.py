@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.base.files import below, staged
+from icalib.base.files import below, staged, write_text
 from icalib.data.measurements import CornerStream, ImuStream, TrackStream
 from icalib.errors import RecordingError
 from icalib.tools.simulation.output import write_table
+from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario.scenario import Scenario
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth
 
@@ -50,7 +51,7 @@ def atomic_output(path: Path) -> Iterator[Path]:
 def write_tables(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes the measurements as tables, and their truth, to the new folder `path`, atomically.
+    """Writes the measurements as tables, their truth, and their rig file, to the new folder `path`, atomically.
 
     Returns an empty tuple, as nothing is left out, see `write_sensors`. Raises RecordingError if `path` exists or
     cannot be written, CalibrationError if a sensor's name is no valid folder name.
@@ -64,6 +65,7 @@ def write_tables(
         for sensor in simulation.scenario.sensors:
             steps.append(partial(sensor.write_table, below(folder, sensor.name), measured.streams[sensor.name]))
         steps += [partial(write_truth, simulation, seed, folder)]
+        steps += [partial(write_text, folder / "rig.yaml", rig_text(simulation.scenario))]
         for i, step in enumerate(steps):
             step()
             progress((i + 1) / len(steps))
