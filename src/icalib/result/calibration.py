@@ -141,6 +141,7 @@ class Calibration:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+    made: str = ""  # date and time of the calibration, UTC, ISO 8601; empty if unknown
     recordings: tuple[RecordingSpan, ...] = ()  # in order of time; arrays of seconds cover all of them
     planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
     cross_validation: CrossValidation | None = None  # None if the recording could not be split
