@@ -61,6 +61,14 @@ def load_matplotlib() -> Any:
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
 
 
+def load_pandas() -> Any:
+    """The module pandas, which nothing else needs. Raises RecordingError where it is not installed."""
+    try:
+        return importlib.import_module("pandas")
+    except ImportError:
+        raise RecordingError("Data frames need the package pandas, which is missing; run pip install pandas.") from None
+
+
 def load_rerun() -> Any:
     """The module rerun, with rerun.blueprint imported. Raises RecordingError where it is not installed."""
     _load("rerun.blueprint", "view", "The 3D view needs the package rerun-sdk")
