@@ -63,10 +63,7 @@ def load_matplotlib() -> Any:
 
 def load_pandas() -> Any:
     """The module pandas, which nothing else needs. Raises RecordingError where it is not installed."""
-    try:
-        return importlib.import_module("pandas")
-    except ImportError:
-        raise RecordingError("Data frames need the package pandas, which is missing; run pip install pandas.") from None
+    return _load("pandas", "pandas", "Data frames need the package pandas")
 
 
 def load_rerun() -> Any:

@@ -263,9 +263,8 @@ def write_new(path: Path, text: str) -> None:
     with writing(path, "choose another place"):
         try:
             with staged(path.parent) as place:
-                part = place / path.name
-                write_text(part, text)
-                _link(part, path, text)
+                write_text(place / path.name, text)
+                _link(place / path.name, path, text)
         except FileExistsError:
             raise CalibrationError(f"{path} exists and was not changed; give another name.") from None
 

@@ -5,15 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from icalib.base.files import (
-    check_writable,
-    printable,
-    refuse_foreign,
-    refuse_foreign_set,
-    sealed,
-    write_files,
-    write_sealed,
-)
+from icalib.base.files import check_writable, printable, refuse_foreign_set, sealed, write_files
 from icalib.export.kalibr import kalibr_texts
 from icalib.report import report_html
 from icalib.result import Calibration, calibration_files
@@ -34,13 +26,6 @@ def output_files(calibration: Calibration) -> dict[str, bytes]:
     texts = {"report.html": report_html(calibration)}
     texts |= {name: text(calibration) for name, text in kalibr_texts(calibration).items()}
     return calibration_files(calibration) | {name: sealed(printable(text).encode()) for name, text in texts.items()}
-
-
-def write_report(calibration: Calibration, path: str | Path) -> None:
-    """Write the report, a page of HTML, to `path`. Raises CalibrationError if it cannot be written, or a file that
-    icalib did not write is there."""
-    refuse_foreign([Path(path)], (), "choose another name")
-    write_sealed(Path(path), printable(report_html(calibration)))
 
 
 def check_folder(folder: str | Path, inputs: Sequence[Path] = ()) -> None:

@@ -335,8 +335,7 @@ class Calibration:
             groups = tuple(g for g in self.groups if g.sensor == sensor and g.name not in MOUNTED_NAMES)
             for (group, label), key in parameter_keys(groups).items():
                 if key == name:
-                    found = self.group(sensor, group)
-                    return found, found.labels.index(label)
+                    return self.group(sensor, group), self.group(sensor, group).labels.index(label)
         return self.group(sensor, name), ...
 
     def T(self, frame: str, sensor: str) -> RelativePose:
@@ -372,8 +371,12 @@ class Calibration:
         return import_module("icalib.export.formats").write_export(self, to, folder)  # a higher layer
 
     def report(self, path: str | Path) -> None:
-        """Write the report, a page of HTML, to `path`. Raises CalibrationError if it cannot be written."""
-        import_module("icalib.export.outputs").write_report(self, path)  # a higher layer
+        """Write the report, a page of HTML, to `path`. Raises CalibrationError if it cannot be written, or a file that
+        icalib did not write is there."""
+        from icalib.base.files import printable, refuse_foreign, write_sealed
+
+        refuse_foreign([Path(path)], (), "choose another name")
+        write_sealed(Path(path), printable(import_module("icalib.report").report_html(self)))  # a higher layer
 
     def __repr__(self) -> str:
         from icalib.result.text import one_line

@@ -13,7 +13,7 @@ from icalib.geometry.euler import rpy, rpy_std
 from icalib.result.body_frame import in_body_frame
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, joint_covariance, relative_poses
-from icalib.rig.kinds import ONE, SENSOR_TYPES
+from icalib.rig.kinds import ONE
 from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 
 HEADER = """\
@@ -91,18 +91,13 @@ def reference_name(c: Calibration) -> str:
 
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     """Entry of the sensor `name`. `c` is a result of `in_body_frame`."""
-    kind, entry = c.rig["sensors"][name]["type"], _entry(c, name)
-    if not SENSOR_TYPES[kind].is_inertial:
-        return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | entry
     T = np.eye(4) if name == c.body else c.T_imu_sensor(name)
-    return {"type": kind, pose_key(c): T.tolist()} | entry
+    return {"type": c.rig["sensors"][name]["type"], pose_key(c): T.tolist()} | _entry(c, name)
 
 
 def _origin(c: Calibration) -> dict[str, Any]:
     """When the result was made, and from which recordings and files."""
-    recordings = [
-        {"name": r.name, "seconds": round(r.end - r.start, 3), "first_stamp_ns": r.origin_ns} for r in c.recordings
-    ]
+    recordings = [{"name": r.name, "seconds": r.end - r.start, "first_stamp_ns": r.origin_ns} for r in c.recordings]
     return {"date": c.made or None, "recordings": recordings, "sha256": dict(c.inputs)}
 
 

@@ -61,18 +61,8 @@ class JobRecord:
         low, high = WALL_CLOCK_NS
         blocks = tuple(_block(result, g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
-        return cls(
-            name,
-            result.failure,
-            seconds,
-            inputs,
-            result.status,
-            known,
-            result.unobservable,
-            result.warnings,
-            blocks,
-            result.verdict,
-        )
+        about = (result.status, known, result.unobservable, result.warnings, blocks, result.verdict)
+        return cls(name, result.failure, seconds, inputs, *about)
 
 
 def _block(c: Calibration, g: ParameterGroup) -> GroupRecord:

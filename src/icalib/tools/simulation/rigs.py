@@ -19,9 +19,7 @@ from icalib.tools.simulation.sensors.imu import rotation_from_vector
 from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
-_HEADER = """\
-# Rig file of a simulated recording: sensors, noise and target. Nothing that is estimated has a value in it.
-"""
+_HEADER = "# Rig file of a simulated recording: sensors, noise and target, without any value that is estimated.\n"
 _GUESS_STREAM = 3000  # number of the random stream of guesses; `simulate` has the others
 
 

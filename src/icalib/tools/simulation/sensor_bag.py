@@ -9,13 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from icalib.base.files import write_text
 from icalib.data.measurements import ImuStream
 from icalib.errors import RigError
 from icalib.tools.simulation.images.filming import Film
 from icalib.tools.simulation.images.rendering import Imaging
 from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagWriter
-from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
 from icalib.tools.simulation.tables import atomic_output, write_truth
@@ -47,8 +45,7 @@ def write_sensors(
                 bag.write(topic, make(bag), at_ns)
                 progress(1.0 - (last_ns - at_ns) / span_ns)
         if not ros1:
-            write_truth(simulation, seed, place)
-            write_text(place / "rig.yaml", rig_text(simulation.scenario, topics))
+            write_truth(simulation, seed, place, topics)
     return notes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -65,15 +65,15 @@ def write_tables(
         for sensor in simulation.scenario.sensors:
             steps.append(partial(sensor.write_table, below(folder, sensor.name), measured.streams[sensor.name]))
         steps += [partial(write_truth, simulation, seed, folder)]
-        steps += [partial(write_text, folder / "rig.yaml", rig_text(simulation.scenario))]
         for i, step in enumerate(steps):
             step()
             progress((i + 1) / len(steps))
     return ()
 
 
-def write_truth(simulation: Simulation, seed: int, folder: Path) -> None:
-    """Writes truth.yaml and truth.npz to the existing folder `folder`."""
+def write_truth(simulation: Simulation, seed: int, folder: Path, topics: Iterable[str] | None = None) -> None:
+    """Writes truth.yaml, truth.npz and rig.yaml to the existing folder `folder`. topics: see `rig_text`."""
+    write_text(folder / "rig.yaml", rig_text(simulation.scenario, topics))
     truth = simulation.truth
     text = yaml.safe_dump(_plain_truth(simulation.scenario, truth, seed), sort_keys=False, default_flow_style=None)
     (folder / "truth.yaml").write_text(_TRUTH_HEADER + text, encoding="utf-8")

@@ -13,7 +13,6 @@ from icalib.observability.cause import Cause
 from icalib.result import ParameterGroup
 from icalib.sensors.camera.assess.twin_lenses import observed
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.spec import INTRINSICS
 
 # Principal point over the middle of the stated image. Lenses are centred to a tenth of the image; half the resolution
 # (binning, or a scaled stream) gives 0.5.
@@ -26,19 +25,18 @@ KNOWN = 0.02  # largest standard deviation of the principal point over the size 
 
 def wrong_resolutions(inputs: Inputs, estimate: Estimate, groups: Sequence[ParameterGroup]) -> Iterator[Cause]:
     """A grave cause for each camera with a lens that is estimated, whose images seem to be smaller than stated."""
-    lenses = {g.sensor: g for g in groups if g.name == INTRINSICS.name and g.mode != "fixed"}
+    lenses = {g.sensor: g for g in groups if g.name == "intrinsics" and g.mode != "fixed"}
     for camera, factor in zip(inputs.rig.cameras, of_type(estimate.problem.factors, CornerFactor), strict=True):
-        if camera.name in lenses and len(uv := observed(estimate, factor)):
-            g = lenses[camera.name]
-            if (size := smaller_image(camera.resolution, g.value[2:4], g.std[2:4], uv)) is not None:
-                width, height = camera.resolution
-                yield Cause(
-                    f"the resolution of {camera.name} is wrong: its principal point ({g.value[2]:.0f}, "
-                    f"{g.value[3]:.0f}) px and all observations are those of images of about {size[0]} x {size[1]} px, "
-                    f"not {width} x {height}. Correct its resolution in the rig file.",
-                    np.inf,
-                    True,
-                )
+        uv, g = observed(estimate, factor), lenses.get(camera.name)
+        if g is None or not len(uv):
+            continue
+        if (size := smaller_image(camera.resolution, g.value[2:4], g.std[2:4], uv)) is not None:
+            stated, shown = (f"{width} x {height}" for width, height in (camera.resolution, size))
+            sentence = (
+                f"the resolution of {camera.name} is wrong: its principal point and all observations are those of "
+                f"images of about {shown} px, not {stated}. Correct its resolution in the rig file."
+            )
+            yield Cause(sentence, np.inf, True)
 
 
 def smaller_image(
