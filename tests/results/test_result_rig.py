@@ -30,8 +30,7 @@ def parameter(rig: Any, sensor: str, name: str) -> Parameter:
 def test_the_file_loads_back(robot: Calibration, tmp_path: Path, treatment: Treatment):
     robot.save(tmp_path / "out")
     file = tmp_path / "rig.yaml"
-    for _ in range(2):  # a file of its own is replaced
-        assert main(["rig", str(tmp_path / "out"), "--as", treatment, "-o", str(file), "-q"]) == 0
+    assert main(["rig", str(tmp_path / "out"), "--as", treatment, "-o", str(file), "-q"]) == 0
     loaded = load_rig(file)
     assert rig_to_dict(loaded) == rig_to_dict(rig_of_result(robot, treatment)[0])
     for sensor, name in ESTIMATED:
