@@ -16,6 +16,7 @@ from icalib.result.verdict import counted, worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
 from icalib.sensors.parameter_spec import display_unit
+from icalib.sensors.sensor import ROTATION
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
@@ -79,14 +80,15 @@ def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
 
 
 def records(c: Calibration) -> list[dict[str, Any]]:
-    """A record for each entry of each group, SI. The values of a rotation are roll, pitch and yaw."""
+    """A record for each entry of each group, SI. The entries of a rotation are roll, pitch and yaw; a target's
+    tilt has no values."""
     out = list[dict[str, Any]]()
     for g in nontrivial_groups(c):
-        labels, values, std, verdicts = g.labels, g.value, g.std, g.verdict
-        if g.value.ndim == 2:
+        labels, values, std, verdicts = g.labels, _values(g, 1.0), g.std, g.verdict
+        if g.name == ROTATION.name:
             labels, verdicts = TURNS, (worst(g.verdict),) * len(TURNS)
-            values, std = euler.rpy(g.value), euler.rpy_std(g.value, joint_covariance(c, [g]))
-        for label, value, sigma, verdict in zip(labels, values.tolist(), std.tolist(), verdicts, strict=True):
+            values, std = euler.rpy(g.value).tolist(), euler.rpy_std(g.value, joint_covariance(c, [g]))
+        for label, value, sigma, verdict in zip(labels, values, std.tolist(), verdicts, strict=True):
             about = {"sensor": g.sensor, "group": g.name, "entry": label or g.name, "value": value}
             out.append(about | {"std": sigma, "unit": g.unit, "verdict": verdict})
     return out
