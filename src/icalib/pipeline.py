@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from datetime import UTC, datetime
 from math import inf
 from pathlib import Path
 
@@ -167,7 +168,7 @@ def _calibrate(
     result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
     _refuse_no_numbers(result, rig)
     clock.lap("judging")
-    return dataclasses.replace(result, timings=clock.laps)
+    return dataclasses.replace(result, timings=clock.laps, made=datetime.now(UTC).isoformat(timespec="seconds"))
 
 
 def _refuse_no_numbers(result: Calibration, rig: Rig) -> None:

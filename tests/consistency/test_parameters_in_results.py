@@ -42,6 +42,8 @@ def test_every_parameter_of_a_robot_is_in_its_result(robot):
             for verdict, size in zip(g.verdict, g.std / np.array(tolerance), strict=True):
                 assert worst((verdict, by_size(float(size)))) == verdict
             assert true_value(simulation.truth, sensor.name, spec.name) is not None
+            if {*g.verdict} == {"fixed"}:
+                continue
             std = plain[sensor.name]["std"]
             keys = parameter_keys(tuple(x for x in result.groups if x.sensor == sensor.name and x.name not in std))
             own = [std[spec.name]] if spec in MOUNTED else [std["parameters"][keys[spec.name, n]] for n in spec.labels]

@@ -107,6 +107,14 @@ def test_results_that_cannot_be_read_or_compared_are_notes(results: dict[str, Ca
     assert (alone.n_tested, alone.notes) == (0, ())
 
 
+def test_a_result_that_is_not_usable_is_compared_with_nothing(results: dict[str, Calibration]):
+    good = results["r0"]
+    bad = dataclasses.replace(results["turned"], wrong=("cam1 is wrong.",), warnings=("cam1 is wrong.",))
+    found = drift([good, bad, good])
+    assert (found.changes, found.unsure, found.n_tested) == ((), (), 8)
+    assert found.notes == ("job 1 is not usable and is not compared: cam1 is wrong.",)
+
+
 def test_chance_is_that_of_a_normal_deviate():
     assert by_chance(1000, 3.0) == pytest.approx(1000 * 2.0 * norm.sf(3.0))
     assert by_chance(0, 3.0) == 0.0

@@ -14,6 +14,7 @@ from icalib.tools.fleet.figures import over_time, sensors
 from icalib.tools.fleet.jobs import Job
 from icalib.tools.fleet.record import GroupRecord, JobRecord
 from icalib.tools.fleet.result import JobResult
+from icalib.tools.fleet.words import care_words, verdict_words
 
 R0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 XYZ = ("x", "y", "z")
@@ -88,3 +89,14 @@ def test_without_times_of_their_own_jobs_stand_in_order():
     for other, name in ((undated, "job1"), (twin, "twin")):
         drawn = over_time([one, other], "cam0")
         assert drawn["data"][0]["x"] == ["job2", name] and drawn["layout"]["xaxis"]["type"] == "category"
+
+
+def test_verdicts_are_counted_the_best_first():
+    verdicts = ("not usable", "usable", "usable with care", "usable")
+    results = [
+        replace(r, record=replace(r.record, verdict=verdict))
+        for r, verdict in zip(map(result, range(1, 5)), verdicts, strict=True)
+    ]
+    failed = replace(results[0], record=replace(results[0].record, failure="no corners."))
+    assert verdict_words([*results, failed]) == "2 usable, 1 usable with care, 1 not usable"
+    assert care_words(results[0]) == "not usable"

@@ -110,7 +110,7 @@ def test_a_failed_job_is_kept_with_its_sentence_and_others_go_on(fleet_folder: P
     assert "Changed: anton, anton-r0 to anton-turned: cam1 turned by 0.0" in out
     assert list((fleet_folder / "out" / "jobs" / "berta-bad").iterdir())[0].name == "fleet-job.json"
     assert query(fleet_folder, "SELECT * FROM results WHERE status = 'failed'") == [
-        ("berta", "2026-10-09T00:00:00+00:00", "berta-bad", "failed", "bad is cut off; record <again>.", *[None] * 7)
+        ("berta", "2026-10-09T00:00:00+00:00", "berta-bad", "failed", "bad is cut off; record <again>.", *[None] * 8)
     ]
     assert main([*arguments, "--quiet"]) == 1 and len(workshop.done) == 5
     assert capsys.readouterr().out == ""

@@ -55,7 +55,7 @@ def test_steered_wheels_are_exact_without_noise():
         ("twist", TWIST * [1.0, 180.0 / np.pi] * SCALES, "its yaw rate must be in rad/s, not deg/s"),
         ("twist", TWIST * [30.0, 1.0], "its forward speed would have to be multiplied by 0.0367; check its unit"),
         ("twist", TWIST * [1.0, -1.0], "its yaw rate would have to be multiplied by -0.9"),
-        ("steered", STEERED * [1.0, 1.0, -1.0, 1.0], "its steering angle is positive to the right; change its sign"),
+        ("steered", STEERED * [1.0, 1.0, -1.0, 1.0], "its steering angle is positive to the right; set signs to"),
         ("steered", STEERED * [0.001, 1.0, 1.0, 1.0], "its wheels would have radii of 120 m"),
     ],
 )

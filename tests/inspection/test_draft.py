@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 from tests.typed import not_none
 
+from icalib.base.files import write_new
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig.file import load_rig, load_target
 from icalib.sensors.imu.spec import class_imperfections
 from icalib.tools.inspection import inspect_recording
-from icalib.tools.inspection.draft import draft_rig, write_draft
+from icalib.tools.inspection.draft import draft_rig
 
 SIZE = (32, 24)
 K = (40.5, 41.5, 15.25, 11.75)
@@ -363,7 +364,7 @@ def test_nothing_is_overwritten(made, bags, brief, tmp_path, capsys):
 def test_a_file_that_appears_meanwhile_is_kept(tmp_path):
     (tmp_path / "rig.yaml").write_text("mine")
     with pytest.raises(CalibrationError, match=r"rig\.yaml exists"):
-        write_draft("draft", tmp_path / "rig.yaml")
+        write_new(tmp_path / "rig.yaml", "draft")
     assert [p.read_text() for p in tmp_path.iterdir()] == ["mine"]
 
 
@@ -377,16 +378,16 @@ def test_a_file_system_without_links(there, tmp_path, monkeypatch):
     if there:
         path.write_text("mine")
         with pytest.raises(CalibrationError, match=r"rig\.yaml exists"):
-            write_draft("draft", path)
+            write_new(path, "draft")
     else:
-        write_draft("draft", path)
+        write_new(path, "draft")
     assert [p.read_text() for p in tmp_path.iterdir()] == ["mine" if there else "draft"]
 
 
 def test_the_file_is_whole_and_readable_by_others(tmp_path):
     before = os.umask(0o022)
     try:
-        write_draft("draft", tmp_path / "rig.yaml")
+        write_new(tmp_path / "rig.yaml", "draft")
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "rig.yaml").stat().st_mode) == 0o644
@@ -395,7 +396,7 @@ def test_the_file_is_whole_and_readable_by_others(tmp_path):
 
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(CalibrationError, match=r"rig\.yaml cannot be written .*choose another place"):
-        write_draft("draft", tmp_path / "away" / "rig.yaml")
+        write_new(tmp_path / "away" / "rig.yaml", "draft")
 
 
 def test_no_draft_without_camera(bags, brief, tmp_path, capsys):

@@ -14,7 +14,9 @@ import pytest
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.result import Calibration, by_key, load_calibration
+from icalib.result import Calibration, ParameterGroup, by_key, load_calibration
+from icalib.result.calibration import RecordingSpan
+from icalib.result.summary import calibration_yaml
 from icalib.validation.misfit import scatter_warnings
 
 
@@ -45,6 +47,23 @@ def test_arrays_need_no_pickle(saved: Path):
         assert all(file[name].dtype.kind in "fibU" for name in file.files)
 
 
+def test_yaml_says_when_and_from_what_it_was_made(calibration: Calibration):
+    span = RecordingSpan("run.bag", 0.5, 20.75, 1_700_000_000_000_000_000)
+    made = dataclasses.replace(calibration, made="2026-03-01T12:00:00+00:00", recordings=(span,))
+    data = yaml.safe_load(calibration_yaml(made))
+    assert data["date"] == "2026-03-01T12:00:00+00:00" and data["sha256"] == calibration.inputs
+    assert data["recordings"] == [{"name": "run.bag", "seconds": 20.25, "first_stamp_ns": span.origin_ns}]
+    assert yaml.safe_load(calibration_yaml(calibration))["date"] is None
+
+
+def test_yaml_has_no_zeros_of_an_ideal_imu(calibration: Calibration):
+    group = calibration.group_or_none("imu0", "intrinsics")
+    ideal = ParameterGroup("imu0", "intrinsics", ("a", "b"), "", *[np.zeros(2)] * 3, ("fixed",) * 2, "fixed")
+    groups = (*(g for g in calibration.groups if g is not group), ideal)
+    imu = yaml.safe_load(calibration_yaml(dataclasses.replace(calibration, groups=groups)))["sensors"]["imu0"]
+    assert imu["parameters"] == imu["std"]["parameters"] == imu["verdict"]["parameters"] == {}
+
+
 def test_yaml_is_what_the_design_says(calibration: Calibration, saved: Path):
     data = yaml.safe_load((saved / "calibration.yaml").read_text())
     cam = data["sensors"]["cam1"]
@@ -54,13 +73,14 @@ def test_yaml_is_what_the_design_says(calibration: Calibration, saved: Path):
     assert list(cam["parameters"]) == ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "bloom"]
     assert cam["parameters"]["fy"] == 456.134
     assert cam["std"]["rotation"] == calibration.group("cam1", "rotation").std.tolist()
-    assert cam["std"]["parameters"]["k1"] == 0.0
+    assert "k1" not in cam["std"]["parameters"]  # fixed
     assert cam["verdict"]["translation"] == ["determined", "unobservable", "weak"]
     assert cam["verdict"]["parameters"]["k1"] == "fixed"
     assert cam["verdict"]["time_offset"] == "determined"
     assert cam["empirical_factor"]["translation"] == [2.7] * 3
     assert "k1" not in cam["empirical_factor"]["parameters"]
     assert data["sensors"]["imu0"]["T_imu_sensor"] == np.eye(4).tolist()
+    assert "time_offset" not in data["sensors"]["imu0"] and "translation" not in data["sensors"]["imu0"]["std"]
     assert np.shape(data["targets"]["board0"]["tilt"]) == (3, 3)
     assert data["fits"][0]["chi2_per_dof"] == pytest.approx(20011.2 / 19800.5)
     assert data["fits"][-1]["chi2_per_dof"] is None

@@ -73,6 +73,15 @@ def test_a_result_is_the_same_as_itself(robot: Calibration, without_cameras: Cal
     } <= blocks
 
 
+def test_nothing_is_said_of_rounding_errors(robot: Calibration):
+    """No "+0 %" and no 3e-14 px: a block that is the same did not change."""
+    found = compared(robot, changed(robot, {("cam0", "intrinsics"): np.full(4, 1e-11)}))
+    assert 0.0 < only(found, "cam0", "lens").size < 1e-9
+    words = [sentence(d, found) for d in found.differences]
+    assert all("did not change" in one and not re.search(r"\d e|\de-\d|[+] ?0|sigma", one) for one in words)
+    assert "the lens of cam0 did not change" in words
+
+
 def test_what_changed_is_said_in_words(robot: Calibration):
     steps = {
         ("cam1", "rotation"): np.deg2rad([0.3, 0.0, 0.0]),
@@ -89,7 +98,7 @@ def test_what_changed_is_said_in_words(robot: Calibration):
     assert re.search(r"DIFFERS  the time offset of cam0 changed by \+0\.50 ms, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  the right radius of wheel0 changed by \+0\.98 %, \d+\.\d sigma", text)
     assert re.search(r"DIFFERS  the lens of cam0 moved points by 1\.\d px RMS, \d\.\d px at most, \d+\.\d sigma", text)
-    assert re.search(r"same     lidar0 turned by 0 deg about its x axis, 0\.0 sigma", text)
+    assert re.search(r"same     the rotation of lidar0 did not change", text)
     assert "unobservable or too uncertain in A and B" in sentence(only(found, "cam1", "translation", "imu0"), found)
     assert re.search(r"\d+ of \d+ differ\.$", text)
 

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import sys
 from html.parser import HTMLParser
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -102,3 +105,42 @@ def test_the_covariance_of_the_imu_in_a_camera(robot: Calibration):
 def test_load_calibration_is_at_hand(robot: Calibration, tmp_path):
     robot.save(tmp_path)
     assert repr(icalib.load_calibration(tmp_path)) == repr(robot)
+
+
+def test_one_parameter_by_its_name(robot: Calibration):
+    assert robot.value("cam0", "fx") == robot.value("cam0", "intrinsics")[0]
+    assert robot.std("wheel0", "radius_right") == robot.std("wheel0", "radii")[1]
+    with pytest.raises(KeyError, match="no fz of cam0; there are .*cam0.intrinsics"):
+        robot.value("cam0", "fz")
+
+
+def test_a_data_frame_has_a_row_for_each_entry(robot: Calibration, monkeypatch: pytest.MonkeyPatch):
+    """pandas is no dependency: a module of that name stands for it."""
+    monkeypatch.setitem(sys.modules, "pandas", SimpleNamespace(DataFrame=list))
+    rows = {(r["sensor"], r["group"], r["entry"]): r for r in robot.to_dataframe()}
+    row = rows["cam1", "translation", "y"]
+    group = robot.group("cam1", "translation")
+    assert (row["value"], row["std"], row["unit"], row["verdict"]) == (
+        group.value[1], group.std[1], "m", "unobservable",
+    )  # fmt: skip
+    assert {("cam0", "rotation", turn) for turn in ("roll", "pitch", "yaw")} <= rows.keys()
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(icalib.CalibrationError, match="need the package pandas, .*run pip install"):
+        robot.to_dataframe()
+
+
+def test_a_calibration_writes_exports_and_its_report(robot: Calibration, tmp_path: Path):
+    sentences = robot.export("kalibr", tmp_path / "kalibr")
+    assert (tmp_path / "kalibr" / "camchain-imucam.yaml").exists()
+    assert "Kalibr has no place for lidar0, wheel0; see calibration.yaml." in sentences
+    robot.report(tmp_path / "report.html")
+    assert "<title>Calibration of imu0" in (tmp_path / "report.html").read_text()
+    (tmp_path / "report.html").write_text("mine")
+    with pytest.raises(icalib.CalibrationError, match="was not written by icalib"):
+        robot.report(tmp_path / "report.html")
+
+
+def test_commands_are_functions_of_the_package(robot: Calibration, tmp_path: Path):
+    robot.save(tmp_path / "out")
+    assert icalib.compare(robot, str(tmp_path / "out")).same
+    assert icalib.check.__name__ == "check_calibration" and icalib.inspect.__name__ == "inspect_recording"

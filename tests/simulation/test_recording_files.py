@@ -16,6 +16,7 @@ from icalib.data.recordings.bag import BagRecording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import ImuSensor
+from icalib.rig.file import load_rig
 from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.lidar.read.point_clouds import point_clouds
@@ -49,6 +50,12 @@ def folder(simulation, tmp_path_factory):
     path = tmp_path_factory.mktemp("tables") / "run"
     assert write_tables(simulation, 3, path) == ()
     return path
+
+
+def test_the_rig_file_is_beside_the_tables(scenario, folder):
+    rig = load_rig(folder / "rig.yaml")
+    assert set(rig.sensors) == set(rig_for(scenario).sensors) and rig.target == rig_for(scenario).target
+    assert all(c.intrinsics.value is None and c.distortion.value is None for c in rig.cameras)
 
 
 def test_tables_read_back_exactly(simulation, folder):
@@ -206,7 +213,12 @@ def test_the_command_line_makes_a_recording_from_a_scenario(tmp_path, capsys):
     a, b, c = ((tmp_path / name / "imu0" / "data.csv").read_bytes() for name in "abc")
     assert a == b != c
     assert main(["simulate", str(file), "-o", str(tmp_path / "d"), "--level", "sensor"]) == 0
-    assert {p.name for p in (tmp_path / "d").iterdir()} == {"d.mcap", "metadata.yaml", "truth.yaml", "truth.npz"}
+    written = {p.name for p in (tmp_path / "d").iterdir()}
+    assert written == {"d.mcap", "metadata.yaml", "rig.yaml", "truth.yaml", "truth.npz"}
+    for name in "ad":
+        rig = load_rig(tmp_path / name / "rig.yaml")
+        assert set(rig.sensors) == {"imu0", "lidar0"}
+        assert all(getattr(s, spec.name).value is None for s in rig.lidars for spec in s.stated())
     capsys.readouterr()
     assert main(["simulate", str(file), "-o", str(tmp_path / "a")]) == 1
     assert "a exists already; remove it" in capsys.readouterr().err

@@ -61,6 +61,11 @@ def load_matplotlib() -> Any:
     return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
 
 
+def load_pandas() -> Any:
+    """The module pandas, which nothing else needs. Raises RecordingError where it is not installed."""
+    return _load("pandas", "pandas", "Data frames need the package pandas")
+
+
 def load_rerun() -> Any:
     """The module rerun, with rerun.blueprint imported. Raises RecordingError where it is not installed."""
     _load("rerun.blueprint", "view", "The 3D view needs the package rerun-sdk")

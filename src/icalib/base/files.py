@@ -252,6 +252,34 @@ def refuse_foreign(paths: Iterable[Path], inputs: Iterable[Path] = (), advice: s
             raise CalibrationError(f"{path} cannot be read ({error.strerror or error}); {advice}.") from error
 
 
+def refuse_existing(path: Path, advice: str = "give another name") -> None:
+    """Raises CalibrationError if `path` exists, whoever wrote it. advice: end of the message."""
+    if os.path.lexists(path):
+        raise CalibrationError(f"{path} exists and was not changed; {advice}.")
+
+
+def write_new(path: Path, text: str) -> None:
+    """Writes `text` to `path` atomically. Raises CalibrationError if `path` exists or cannot be written."""
+    with writing(path, "choose another place"):
+        try:
+            with staged(path.parent) as place:
+                write_text(place / path.name, text)
+                _link(place / path.name, path, text)
+        except FileExistsError:
+            raise CalibrationError(f"{path} exists and was not changed; give another name.") from None
+
+
+def _link(part: Path, path: Path, text: str) -> None:
+    """Gives the file `part` the name `path`. Unlike a rename, this raises FileExistsError if `path` exists."""
+    try:
+        os.link(part, path)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+
+
 def _has_seal(path: Path, kinds: tuple[re.Pattern[bytes], ...]) -> bool:
     size = path.stat().st_size
     with path.open("rb") as file:

@@ -307,14 +307,14 @@ def _fleet(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from icalib.base.files import refuse_foreign, write_sealed
+    from icalib.base.files import refuse_existing, refuse_foreign, write_new, write_sealed
     from icalib.cli.console import progress_bar
-    from icalib.tools.inspection import draft_rig, inspect_recording, read_target, write_draft
+    from icalib.tools.inspection import draft_rig, inspect_recording, read_target
     from icalib.tools.inspection.console import figures_json, print_inspection
-    from icalib.tools.inspection.draft import check_draft
 
     if options.rig:
-        check_draft(options.rig)
+        advice = "give another name for the draft, or give it as --target to use the target in it"
+        refuse_existing(options.rig, advice)
     if options.json:
         if not options.json.parent.is_dir():
             raise CalibrationError(
@@ -331,6 +331,6 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.json:
         write_sealed(options.json, figures_json(inspection))
     if options.rig:
-        write_draft(draft_rig(inspection), options.rig)
+        write_new(options.rig, draft_rig(inspection))
         if not options.quiet:
             print(f"Wrote {options.rig}, a draft: check it, and fill in what is missing.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import get_args
 
 from icalib.cli.command_parser import CommandParser, add_command, add_part, file_path
@@ -154,21 +153,20 @@ def _add_rig(commands: argparse._SubParsersAction[CommandParser]) -> None:
     c.add_argument("result", type=file_path, help="folder that a calibration was written to")
     how = "fixed at the values, priors with the sigma of the result, or guesses to start from"
     c.add_argument("--as", dest="treatment", required=True, choices=("fixed", "prior", "guess"), help=how)
-    c.add_argument("--output", "-o", type=file_path, required=True, metavar="FILE", help="rig file to write")
+    file = "rig file to write; never overwrites a file"
+    c.add_argument("--output", "-o", type=file_path, required=True, metavar="FILE", help=file)
     c.add_argument("--quiet", "-q", action="store_true", help="do not print which values could not be written as asked")
     c.set_defaults(run=_rig)
 
 
 def _rig(options: argparse.Namespace) -> None:
-    from icalib.base.files import refuse_foreign, set_of, write_sealed
+    from icalib.base.files import refuse_existing, sealed, write_new
     from icalib.result import load_calibration
     from icalib.result.as_rig import rig_text
 
-    calibration = load_calibration(options.result)
-    inputs = [*set_of(options.result), *(Path(name) for name in calibration.inputs)]
-    refuse_foreign([options.output], inputs, "choose another name")
-    text, sentences = rig_text(calibration, options.treatment)
-    write_sealed(options.output, text)
+    refuse_existing(options.output)
+    text, sentences = rig_text(load_calibration(options.result), options.treatment)
+    write_new(options.output, sealed(text.encode()).decode())
     if not options.quiet:
         for sentence in sentences:
             print(f"Note: {sentence}")

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.base.files import printable
+from icalib.base.files import printable, refuse_foreign, sealed_texts, write_texts
 from icalib.base.suggestion import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.colmap import colmap
@@ -98,6 +98,18 @@ def export(
             return autoware(c, frames)
         case _:
             return _PLAIN[to](c)
+
+
+def write_export(c: Calibration, to: str, folder: str | Path) -> tuple[str, ...]:
+    """Writes the files of `export` into `folder`. Returns sentences on what the format cannot hold.
+
+    Raises CalibrationError as `export`, and if `folder` cannot be written, or has files of these names that icalib did
+    not write.
+    """
+    exported, place = export(c, to), Path(folder)
+    refuse_foreign(place / name for name in exported.files)
+    write_texts(place, sealed_texts(exported.files))
+    return tuple(exported.sentences)
 
 
 def kalibr(c: Calibration) -> Export:

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from icalib.base.extras import load_pandas
 from icalib.result.cross_validation import CrossValidation
 from icalib.result.planes import Plane
 from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
@@ -19,6 +21,7 @@ from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.record import CornerResiduals, ImageResiduals, TrackResiduals
 from icalib.sensors.imu.record import ImuResiduals
 from icalib.sensors.records import Residuals, RowResiduals
+from icalib.sensors.sensor import MOUNTED_NAMES
 
 if TYPE_CHECKING:
     from icalib.result.relative import RelativePose
@@ -141,6 +144,7 @@ class Calibration:
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     timings: dict[str, float] = field(default_factory=dict)  # stage -> seconds
+    made: str = ""  # date and time of the calibration, UTC, ISO 8601; empty if unknown
     recordings: tuple[RecordingSpan, ...] = ()  # in order of time; arrays of seconds cover all of them
     planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
     cross_validation: CrossValidation | None = None  # None if the recording could not be split
@@ -312,13 +316,27 @@ class Calibration:
         return tuple(name for name in (*self.of_type("imu"), *self.mounted) if name != self.body)
 
     def value(self, sensor: str, name: str) -> np.ndarray:
-        """Value of the group `name` of `sensor`, SI: (3, 3) R_imu_sensor of a rotation, else (n,)."""
-        return self.group(sensor, name).value
+        """Value of the group `name` of `sensor`, SI: (3, 3) R_imu_sensor of a rotation, else (n,); or () of one
+        parameter by its key in calibration.yaml, such as "fx". Raises KeyError, which lists the groups."""
+        group, at = self._find(sensor, name)
+        return np.asarray(group.value[at])
 
     def std(self, sensor: str, name: str) -> np.ndarray:
         """(n,) standard deviations of the group `name` of `sensor`, SI, empirical factors included. Those of a rotation
-        are about the sensor's axes [rad]."""
-        return self.group(sensor, name).std
+        are about the sensor's axes [rad]. () of one parameter, see `value`."""
+        group, at = self._find(sensor, name)
+        return np.asarray(group.std[at])
+
+    def _find(self, sensor: str, name: str) -> tuple[ParameterGroup, Any]:
+        """The group `name`, and the index of all its entries; or the group with the parameter `name`, and its index."""
+        from icalib.result.summary import parameter_keys
+
+        if self.group_or_none(sensor, name) is None:
+            groups = tuple(g for g in self.groups if g.sensor == sensor and g.name not in MOUNTED_NAMES)
+            for (group, label), key in parameter_keys(groups).items():
+                if key == name:
+                    return self.group(sensor, group), self.group(sensor, group).labels.index(label)
+        return self.group(sensor, name), ...
 
     def T(self, frame: str, sensor: str) -> RelativePose:
         """T_frame_sensor, which takes coordinates of `sensor` to `frame`, with its (6, 6) covariance.
@@ -339,6 +357,26 @@ class Calibration:
         from icalib.result.text import summary_text
 
         return summary_text(self)
+
+    def to_dataframe(self) -> Any:
+        """All parameters as a pandas DataFrame, SI: sensor, group, entry, value, std, unit, verdict, a row for each
+        entry. A rotation has the entries roll, pitch and yaw. Raises CalibrationError where pandas is not installed."""
+        from icalib.result.quantities import records
+
+        return load_pandas().DataFrame(records(self))
+
+    def export(self, to: str, folder: str | Path) -> tuple[str, ...]:
+        """Write the files of another program into `folder`; to: one of `icalib.export.formats.FORMATS`. Returns
+        sentences on what the format cannot hold. Raises CalibrationError if files cannot be made or written."""
+        return import_module("icalib.export.formats").write_export(self, to, folder)  # a higher layer
+
+    def report(self, path: str | Path) -> None:
+        """Write the report, a page of HTML, to `path`. Raises CalibrationError if it cannot be written, or a file that
+        icalib did not write is there."""
+        from icalib.base.files import printable, refuse_foreign, write_sealed
+
+        refuse_foreign([Path(path)], (), "choose another name")
+        write_sealed(Path(path), printable(import_module("icalib.report").report_html(self)))  # a higher layer
 
     def __repr__(self) -> str:
         from icalib.result.text import one_line

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import floor, isfinite, log10
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from icalib.result.verdict import counted, worst
 from icalib.rig import LENS
 from icalib.rig.kinds import ONE
 from icalib.sensors.parameter_spec import display_unit
+from icalib.sensors.sensor import ROTATION
 
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
@@ -76,6 +77,21 @@ def _sharpened(calibration: Calibration, group: ParameterGroup) -> list[bool]:
     if group.name != "intrinsics" or not isinstance(prior, dict) or "sigma" not in prior:
         return [True] * len(group.labels)
     return (group.std < SHARPENED * np.array(prior["sigma"])).tolist()
+
+
+def records(c: Calibration) -> list[dict[str, Any]]:
+    """A record for each entry of each group, SI. The entries of a rotation are roll, pitch and yaw; a target's
+    tilt has no values."""
+    out = list[dict[str, Any]]()
+    for g in nontrivial_groups(c):
+        labels, values, std, verdicts = g.labels, _values(g, 1.0), g.std, g.verdict
+        if g.name == ROTATION.name:
+            labels, verdicts = TURNS, (worst(g.verdict),) * len(TURNS)
+            values, std = euler.rpy(g.value).tolist(), euler.rpy_std(g.value, joint_covariance(c, [g]))
+        for label, value, sigma, verdict in zip(labels, values, std.tolist(), verdicts, strict=True):
+            about = {"sensor": g.sensor, "group": g.name, "entry": label or g.name, "value": value}
+            out.append(about | {"std": sigma, "unit": g.unit, "verdict": verdict})
+    return out
 
 
 def nontrivial_groups(calibration: Calibration) -> list[ParameterGroup]:

@@ -83,6 +83,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "reasons": list(c.reasons),
         **{name: list(getattr(c, name)) for name in _TEXTS},
         **{name: getattr(c, name) for name in _PLAIN},
+        "made": c.made,
     }
 
 
@@ -172,6 +173,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
         **{name: tuple(plain[name]) for name in _TEXTS},
         **{name: plain[name] for name in _PLAIN},
+        made=str(plain.get("made", "")),  # earlier results have none
     )
 
 

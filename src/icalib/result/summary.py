@@ -13,8 +13,8 @@ from icalib.geometry.euler import rpy, rpy_std
 from icalib.result.body_frame import in_body_frame
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit
 from icalib.result.relative import RelativePose, joint_covariance, relative_poses
-from icalib.rig.kinds import ONE, SENSOR_TYPES
-from icalib.sensors.sensor import MOUNTED, MOUNTED_NAMES, ROTATION, TRANSLATION
+from icalib.rig.kinds import ONE
+from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 
 HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
@@ -22,7 +22,8 @@ HEADER = """\
 {frames}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor: the scatter of segments over the predicted one; formal = std / factor. Those of roll_pitch_yaw,
-#   R = Rz(yaw) Ry(pitch) Rx(roll), are null within 5 std of gimbal lock (pitch 90 deg).
+#   R = Rz(yaw) Ry(pitch) Rx(roll), are null within 5 std of gimbal lock (pitch 90 deg). What is fixed has none.
+# date: of the calibration, UTC. sha256: of the rig file and all files of the recordings.
 # T_scene_body: poses of a target's bodies, in the frame of that body whose pose is the identity.
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
 #   rotation about the axes of b and translation along those of a; where one is unobservable it is that of the guess.
@@ -44,6 +45,7 @@ def calibration_yaml(calibration: Calibration) -> str:
     sensors = {n: _sensor(in_body, n) for n in names if n in c.rig["sensors"]}
     targets = {n: _target(c, n) for n in names if n not in c.rig["sensors"]}
     data = {
+        **_origin(c),
         "status": c.status,
         "converged": bool(c.converged),
         "verdict": c.verdict,
@@ -89,14 +91,19 @@ def reference_name(c: Calibration) -> str:
 
 def _sensor(c: Calibration, name: str) -> dict[str, Any]:
     """Entry of the sensor `name`. `c` is a result of `in_body_frame`."""
-    kind, entry = c.rig["sensors"][name]["type"], _entry(c, name)
-    if not SENSOR_TYPES[kind].is_inertial:
-        return {"type": kind, pose_key(c): c.T_imu_sensor(name).tolist()} | entry
-    still = {spec.name: [0.0] * spec.size if spec.size > 1 else 0.0 for spec in MOUNTED}
-    fixed = {spec.name: ["fixed"] * spec.size if spec.size > 1 else "fixed" for spec in MOUNTED}
     T = np.eye(4) if name == c.body else c.T_imu_sensor(name)
-    pose = {"type": kind, pose_key(c): T.tolist(), "time_offset": 0.0}
-    return pose | entry | {"std": still | entry["std"], "verdict": fixed | entry["verdict"]}
+    return {"type": c.rig["sensors"][name]["type"], pose_key(c): T.tolist()} | _entry(c, name)
+
+
+def _origin(c: Calibration) -> dict[str, Any]:
+    """When the result was made, and from which recordings and files."""
+    recordings = [{"name": r.name, "seconds": r.end - r.start, "first_stamp_ns": r.origin_ns} for r in c.recordings]
+    return {"date": c.made or None, "recordings": recordings, "sha256": dict(c.inputs)}
+
+
+def _is_told(c: Calibration, g: ParameterGroup) -> bool:
+    """Whether a group has an entry: zeros of an ideal IMU were not estimated."""
+    return g.sensor != c.imu or g.mode != "fixed" or bool(g.value.any())
 
 
 def _relative(r: RelativePose) -> dict[str, Any]:
@@ -111,8 +118,9 @@ def _target(c: Calibration, name: str) -> dict[str, Any]:
 
 def _entry(c: Calibration, name: str) -> dict[str, Any]:
     """Entry of a sensor or target: time_offset, parameters, and roll, pitch and yaw of a rotation. std, verdict and
-    empirical_factor have the same keys, the latter two without roll, pitch and yaw."""
-    groups = tuple(g for g in c.groups if g.sensor == name)
+    empirical_factor have the same keys, std and the factor only of what was estimated, the latter two without roll,
+    pitch and yaw."""
+    groups = tuple(g for g in c.groups if g.sensor == name and _is_told(c, g))
     rotation = c.group_or_none(name, ROTATION.name)
     by_name = [g for g in groups if g.name in MOUNTED_NAMES or g.value.ndim == 2]
     by_label = tuple(g for g in groups if g.name not in MOUNTED_NAMES and g.value.ndim == 1)
@@ -124,8 +132,9 @@ def _entry(c: Calibration, name: str) -> dict[str, Any]:
         named_values = {g.name: _short(g, value) for g in by_name if (value := of(g)) is not None}
         entry[key] = named_values | {"parameters": _by_key(by_label, {g.name: of(g) for g in by_label})}
     if rotation is not None:
-        std = rpy_std(rotation.value, joint_covariance(c, [rotation])).tolist()
         entry[RPY] = rpy(rotation.value).tolist()
+    if rotation is not None and _std(rotation) is not None:
+        std = rpy_std(rotation.value, joint_covariance(c, [rotation])).tolist()
         entry["std"][RPY] = [None if isnan(s) else s for s in std]
     return entry
 
@@ -140,8 +149,8 @@ def _short(group: ParameterGroup, value: np.ndarray) -> Any:
     return value.tolist()[0] if group.name == "time_offset" and len(value) == 1 else value.tolist()
 
 
-def _std(group: ParameterGroup) -> np.ndarray:
-    return group.std
+def _std(group: ParameterGroup) -> np.ndarray | None:
+    return None if {*group.verdict} == {"fixed"} else group.std  # zeros of what was not estimated are no uncertainty
 
 
 def _verdict(group: ParameterGroup) -> np.ndarray:

@@ -149,7 +149,8 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[str]:
             prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
             yield (
                 f"{_listed(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
-                f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial`, `tactical`), or "
+                f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial` or "
+                "`intrinsics: tactical`), or "
                 "`intrinsics: fixed` if it is calibrated."
             )
         names = [name for name, by_imu in components if not by_imu]

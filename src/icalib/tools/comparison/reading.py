@@ -9,7 +9,7 @@ from icalib.base.input_files import regular
 from icalib.base.suggestion import suggestion
 from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import CalibrationError, RigError
-from icalib.result import load_calibration
+from icalib.result import Calibration, load_calibration
 from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, compare_sides
 from icalib.tools.comparison.other_files import is_kalibr, side_of_kalibr, side_of_urdf, side_of_urdf_alone
 from icalib.tools.comparison.results import side_of_result, side_of_rig
@@ -19,24 +19,26 @@ _XML = b"<"
 
 
 def compare_files(
-    a: Path,
-    b: Path,
+    a: str | Path | Calibration,
+    b: str | Path | Calibration,
     frames: Mapping[str, str] | None = None,
     tolerances: ComparisonTolerances | None = None,
     limit: float = 3.0,
 ) -> Comparison:
-    """Compares two files. a, b: each the folder of a result, a Kalibr camchain or imu file, a URDF, or a rig file.
-    frames: sensor of A -> its name in B, or sensor of one side -> its link in the URDF of the other, if names differ.
+    """Compares two files. a, b: each a calibration, the folder of a result, a Kalibr camchain or imu file, a URDF, or a
+    rig file. frames: sensor of A -> its name in B, or sensor of one side -> its link in the URDF of the other, if names
+    differ.
 
     Raises CalibrationError, one sentence, if a file cannot be read or the two have nothing in common.
     """
     frames = frames or {}
-    if _is_urdf(a) and _is_urdf(b):
+    a, b = (x if isinstance(x, Calibration) else Path(x) for x in (a, b))
+    if isinstance(a, Path) and isinstance(b, Path) and _is_urdf(a) and _is_urdf(b):
         one, other = side_of_urdf_alone(a, b, frames), side_of_urdf_alone(b, a, frames)
-    elif _is_urdf(a):
+    elif isinstance(a, Path) and _is_urdf(a):
         other = _side(b)
         one = _beside(a, other, frames)
-    elif _is_urdf(b):
+    elif isinstance(b, Path) and _is_urdf(b):
         one = _side(a)
         other = _beside(b, one, frames)
     else:
@@ -66,7 +68,9 @@ def _check_known(name: str, side: Side) -> None:
         raise CalibrationError(f"there is no sensor {name} in {side.path}{near}; it has {', '.join(side.sensors)}.")
 
 
-def _side(path: Path) -> Side:
+def _side(path: Path | Calibration) -> Side:
+    if isinstance(path, Calibration):
+        return side_of_result(path, "a calibration")
     if path.is_dir():
         return side_of_result(load_calibration(path), str(path))
     if path.name == "calibration.yaml":

@@ -11,6 +11,7 @@ from icalib.base.files import json_text, printable
 from icalib.tools.comparison.compare import Comparison, Difference
 
 _ALONG = 0.95  # a vector is along one axis if this component is a larger share of its norm
+ROUNDING = 1e-6  # deg, mm, ms, px, %: smaller differences come from the arithmetic, such as that of unprojection
 _TITLES = {True: "same", False: "DIFFERS"}
 
 
@@ -29,6 +30,8 @@ def lines(comparison: Comparison) -> list[str]:
 def sentence(d: Difference, c: Comparison) -> str:
     """A sentence on one difference, such as "cam1 turned by 0.12 deg about its x axis, 4.0 sigma"."""
     relative = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
+    if d.size < ROUNDING:
+        return f"the {d.what} of {d.sensor}{relative} did not change{_open(d)}"
     match d.what:
         case "rotation":
             turn = _axis(d, "about its {} axis", "about its axis {}")
@@ -78,7 +81,7 @@ def _axis(d: Difference, one: str, several: str) -> str:
     several: format for a unit vector."""
     vector = np.array(d.vector)
     most = int(np.argmax(np.abs(vector)))
-    if d.size == 0.0 or abs(vector[most]) >= _ALONG * d.size:
+    if abs(vector[most]) >= _ALONG * d.size:
         return f"{digits(float(vector[most]))} {d.unit} {one.format(d.labels[most])}"
     axis = ", ".join(f"{v:.2f}" for v in vector / d.size)
     return f"{digits(d.size)} {d.unit} {several.format(f'[{axis}]')}"
@@ -90,7 +93,11 @@ def _certainty(d: Difference) -> str:
     else:
         words = f"{d.sigmas:.1f} sigma" + (f" of {d.given_by} alone" if d.given_by in ("A", "B") else "")
         words += f" (tolerance {_tolerance(d)})" if d.tolerance > 0 else ""
-    return words + (f", unobservable or too uncertain in {' and '.join(d.open)}" if d.open else "")
+    return words + _open(d)
+
+
+def _open(d: Difference) -> str:
+    return f", unobservable or too uncertain in {' and '.join(d.open)}" if d.open else ""
 
 
 def _tolerance(d: Difference) -> str:

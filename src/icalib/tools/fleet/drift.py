@@ -61,15 +61,19 @@ class _Comparison:
 
 def drift_of(robot: str, jobs: Sequence[str], load: Callable[[str], Calibration], limit: float) -> Drift:
     """Changes of one robot. jobs: names in order of time. load: returns the result of a job; the message of its
-    CalibrationError becomes a note. limit: sigmas beyond which a block has changed. At most three results are in
-    memory."""
+    CalibrationError becomes a note, as does the first reason of a result that is not usable. limit: sigmas beyond which
+    a block has changed. At most three results are in memory."""
     steps, notes, first, last = list[_Comparison](), list[str](), None, None
     for name in jobs:
         try:
-            side = side_of_result(load(name), name)
+            result = load(name)
         except CalibrationError as error:
             notes.append(str(error))
             continue
+        if result.verdict == "not usable":
+            notes.append(f"{name} is not usable and is not compared: {result.reasons[0]}")
+            continue
+        side = side_of_result(result, name)
         if last is not None:
             steps.append(_step(last, side, limit))
         first, last = first or side, side

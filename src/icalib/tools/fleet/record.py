@@ -40,6 +40,7 @@ class JobRecord:
 
     inputs: hashes of the inputs; None if the worker died, and the record is not stored. stamp_ns: first stamp of the
     recording, None unless it is of a wall clock. unobservable, warnings: sentences. blocks: parameter groups.
+    verdict: `Calibration.verdict`, "" without a result.
     """
 
     name: str
@@ -51,6 +52,7 @@ class JobRecord:
     unobservable: tuple[str, ...] = ()
     warnings: tuple[str, ...] = ()
     blocks: tuple[GroupRecord, ...] = ()
+    verdict: str = ""
 
     @classmethod
     def of(cls, name: str, result: Calibration, seconds: float, inputs: InputHashes) -> JobRecord:
@@ -59,9 +61,8 @@ class JobRecord:
         low, high = WALL_CLOCK_NS
         blocks = tuple(_block(result, g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
-        return cls(
-            name, result.failure, seconds, inputs, result.status, known, result.unobservable, result.warnings, blocks
-        )
+        about = (result.status, known, result.unobservable, result.warnings, blocks, result.verdict)
+        return cls(name, result.failure, seconds, inputs, *about)
 
 
 def _block(c: Calibration, g: ParameterGroup) -> GroupRecord:

@@ -27,6 +27,7 @@ _COLUMNS = (
     "sigma REAL",
     "unit TEXT",
     "verdict TEXT",
+    "usability TEXT",
 )
 _NOTHING = (None,) * 7
 
@@ -60,12 +61,13 @@ def rows(one: JobResult) -> Iterator[tuple[object, ...]]:
         one.status,
         printable(one.sentence),
     )
+    usability = one.record.verdict or None
     if not one.record.blocks:
-        yield about + _NOTHING
+        yield (*about, *_NOTHING, usability)
     for b in one.record.blocks:
         values: list[float | None] = [None] * len(b.labels) if b.value.ndim == 2 else b.value.tolist()
         if b.value.ndim == 2:
             for turn, value, std in zip(TURNS, rpy(b.value).tolist(), b.rpy_std.tolist(), strict=True):
-                yield (*about, b.sensor, b.name, turn, value, std, b.unit, None)
+                yield (*about, b.sensor, b.name, turn, value, std, b.unit, None, usability)
         for label, value, std, verdict in zip(b.labels, values, b.std.tolist(), b.verdict, strict=True):
-            yield (*about, b.sensor, b.name, label or b.name, value, std, b.unit, verdict)
+            yield (*about, b.sensor, b.name, label or b.name, value, std, b.unit, verdict, usability)

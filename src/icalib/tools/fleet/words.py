@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from datetime import datetime
 
+from icalib.result.verdict import EXIT_CODES
 from icalib.tools.comparison.words import digits
 from icalib.tools.fleet.drift import Drift, GroupChange
 from icalib.tools.fleet.result import Fleet, JobResult
@@ -20,7 +22,7 @@ def changed_words(fleet: Fleet) -> str:
     if fleet.drifted:
         return f"Changed over time: {'; '.join(f'{d.robot} ({_listed(d.sensors)})' for d in fleet.drifted)}."
     if not sum(d.n_tested for d in fleet.drifts):
-        return "No robot has two calibrations to compare."
+        return "No robot has two usable calibrations to compare."
     return "Nothing changed over time."
 
 
@@ -69,21 +71,29 @@ def span_words(results: list[JobResult]) -> str:
 
 
 def care_words(one: JobResult) -> str:
-    """Number of unobservable combinations and of warnings of a job; "" if there are none."""
-    parts = [_count(len(one.record.unobservable), "combination") + " unobservable"] if one.record.unobservable else []
+    """Verdict of a job, with the numbers of unobservable combinations and of warnings; "" without a result."""
+    parts = [one.record.verdict] if one.record.verdict else []
+    parts += [_count(len(one.record.unobservable), "combination") + " unobservable"] if one.record.unobservable else []
     parts += [_count(len(one.record.warnings), "warning")] if one.record.warnings else []
     return ", ".join(parts)
 
 
-ROBOT_HEADERS = "robot", "jobs", "failed", "time", "changed"
+def verdict_words(results: list[JobResult]) -> str:
+    """Number of results with each verdict, the best verdict first; without failed jobs."""
+    counts = Counter(r.record.verdict for r in results if not r.failed)
+    return ", ".join(f"{counts[verdict]} {verdict}" for verdict in EXIT_CODES if counts[verdict])
 
 
-def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str]]:
+ROBOT_HEADERS = "robot", "jobs", "failed", "time", "verdicts", "changed"
+
+
+def robot_rows(fleet: Fleet) -> list[tuple[str, int, int, str, str, str]]:
     """A row for each robot, with the cells of `ROBOT_HEADERS`."""
     rows = []
     for drift in fleet.drifts:
         results = [r for r in fleet.results if r.job.robot == drift.robot]
-        rows.append((drift.robot, len(results), sum(r.failed for r in results), span_words(results), drift_cell(drift)))
+        failed, verdicts = sum(r.failed for r in results), verdict_words(results)
+        rows.append((drift.robot, len(results), failed, span_words(results), verdicts, drift_cell(drift)))
     return rows
 
 

@@ -19,13 +19,13 @@ from icalib.base.yaml_nodes import read_yaml
 from icalib.data.recordings import Recording, TopicInfo, open_recording
 from icalib.errors import RecordingError, RigError
 from icalib.rig.file import load_rig, load_target
-from icalib.tools.inspection.draft import draft_rig, write_draft
+from icalib.tools.inspection.draft import draft_rig
 from icalib.tools.inspection.facts import Finding, FramePair, GivenTarget, Inspection, Sources, StreamFacts, timing_of
 from icalib.tools.inspection.findings import findings
 from icalib.tools.inspection.kalibr import KalibrFiles, find_kalibr_files, kalibr_target, yaml_mapping
 from icalib.tools.inspection.kinds import Key, Progress, inspectors
 
-__all__ = ["Finding", "GivenTarget", "Inspection", "draft_rig", "inspect_recording", "read_target", "write_draft"]
+__all__ = ["Finding", "GivenTarget", "Inspection", "draft_rig", "inspect_recording", "read_target"]
 
 
 READING_SHARE = 0.3  # progress after reading, if the target is then searched for

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
-from icalib.base.files import staged, write_text, writing
-from icalib.errors import CalibrationError, RecordingError
+from icalib.errors import RecordingError
 from icalib.geometry.targets import Scene
 from icalib.tools.inspection.facts import Inspection
 from icalib.tools.inspection.kinds import (
@@ -71,39 +68,6 @@ def draft_rig(inspection: Inspection) -> str:
     lines += [f"  # Not used: {comment(topic)} ({comment(why)})" for topic, why in left_out.items()]
     needs_target = any(kind.needs_target(inspection) for kind in inspectors().values())
     return "\n".join([*lines, _target(inspection) if needs_target else ""])
-
-
-def check_draft(path: Path) -> None:
-    """Raises CalibrationError if `path` exists."""
-    if os.path.lexists(path):
-        raise CalibrationError(
-            f"{path} exists and was not changed; give another name for the draft, or give it as --target to "
-            "use the target in it."
-        )
-
-
-def write_draft(text: str, path: Path) -> None:
-    """Writes `text` to `path` atomically. Raises CalibrationError if `path` exists or cannot be written."""
-    with writing(path, "choose another place"):
-        try:
-            with staged(path.parent) as place:
-                part = place / path.name
-                write_text(part, text)
-                _link(part, path, text)
-        except FileExistsError:
-            check_draft(path)
-            raise CalibrationError(f"{path} exists; give another name for the draft.") from None
-
-
-def _link(part: Path, path: Path, text: str) -> None:
-    """Gives the file `part` the name `path`. Unlike a rename, this raises FileExistsError if `path` exists."""
-    try:
-        os.link(part, path)
-    except FileExistsError:
-        raise
-    except OSError:  # a file system without links
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
 
 
 def _without_imu(inspection: Inspection) -> Iterator[str]:

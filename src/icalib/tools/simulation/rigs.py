@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import yaml
 
 from icalib.geometry.targets import NoTarget
 from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
+from icalib.rig.file import rig_to_dict
+from icalib.sensors.imu.spec import BY_CLASS
 from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
 from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
+_HEADER = "# Rig file of a simulated recording: sensors, noise and target, without any value that is estimated.\n"
 _GUESS_STREAM = 3000  # number of the random stream of guesses; `simulate` has the others
 
 
@@ -70,6 +75,22 @@ def rig_for(
         gravity_sigma=0.0,
         settings=settings_for(scenario) if settings is None else settings,
     )
+
+
+def rig_text(scenario: Scenario, topics: Iterable[str] | None = None) -> str:
+    """Text of the rig file of a simulated recording: `rig_for` without any true parameter, and with default settings.
+
+    topics: those of a bag, whose sensors alone are in it, and whose cameras have images and no tables.
+    """
+    imu = BY_CLASS if np.any(scenario.imu_intrinsics) else Parameter("fixed")  # fixed: ideal
+    rig = rig_for(scenario, settings=Settings(), intrinsics="free", distortion="free", imu_intrinsics=imu)
+    if topics is not None:
+        recorded = {topic.split("/")[1] for topic in topics}
+        tracks = TRACK_IMAGES if scenario.room is not None else None
+        images = {"tracks": tracks, "corner_noise_px": None, "track_noise_px": None}  # noise is that of the detector
+        sensors = (s for name, s in rig.sensors.items() if name in recorded)
+        rig = replace(rig, sensors=by_name(*(replace(s, **images) if isinstance(s, Camera) else s for s in sensors)))
+    return _HEADER + yaml.safe_dump(rig_to_dict(rig), sort_keys=False, default_flow_style=None, width=1000)
 
 
 def _camera(scenario: Scenario, sim: SimCamera) -> Camera:

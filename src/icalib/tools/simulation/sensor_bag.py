@@ -26,8 +26,8 @@ _AT_A_TIME = 10_000  # readings that are converted to Python numbers at once, wh
 def write_sensors(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes an MCAP bag and its truth to the new folder `path`, atomically. If `path` ends with .bag, it is a ROS 1
-    bag without truth.
+    """Writes an MCAP bag, its truth and its rig file to the new folder `path`, atomically. If `path` ends with .bag,
+    it is a ROS 1 bag without them.
 
     Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
     or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
@@ -45,7 +45,7 @@ def write_sensors(
                 bag.write(topic, make(bag), at_ns)
                 progress(1.0 - (last_ns - at_ns) / span_ns)
         if not ros1:
-            write_truth(simulation, seed, place)
+            write_truth(simulation, seed, place, topics)
     return notes
 
 

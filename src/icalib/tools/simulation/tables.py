@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 import yaml
 
-from icalib.base.files import below, staged
+from icalib.base.files import below, staged, write_text
 from icalib.data.measurements import CornerStream, ImuStream, TrackStream
 from icalib.errors import RecordingError
 from icalib.tools.simulation.output import write_table
+from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario.scenario import Scenario
 from icalib.tools.simulation.sensors.simulate import Simulation, Truth
 
@@ -50,7 +51,7 @@ def atomic_output(path: Path) -> Iterator[Path]:
 def write_tables(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
-    """Writes the measurements as tables, and their truth, to the new folder `path`, atomically.
+    """Writes the measurements as tables, their truth, and their rig file, to the new folder `path`, atomically.
 
     Returns an empty tuple, as nothing is left out, see `write_sensors`. Raises RecordingError if `path` exists or
     cannot be written, CalibrationError if a sensor's name is no valid folder name.
@@ -70,8 +71,9 @@ def write_tables(
     return ()
 
 
-def write_truth(simulation: Simulation, seed: int, folder: Path) -> None:
-    """Writes truth.yaml and truth.npz to the existing folder `folder`."""
+def write_truth(simulation: Simulation, seed: int, folder: Path, topics: Iterable[str] | None = None) -> None:
+    """Writes truth.yaml, truth.npz and rig.yaml to the existing folder `folder`. topics: see `rig_text`."""
+    write_text(folder / "rig.yaml", rig_text(simulation.scenario, topics))
     truth = simulation.truth
     text = yaml.safe_dump(_plain_truth(simulation.scenario, truth, seed), sort_keys=False, default_flow_style=None)
     (folder / "truth.yaml").write_text(_TRUTH_HEADER + text, encoding="utf-8")

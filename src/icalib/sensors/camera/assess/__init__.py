@@ -23,6 +23,7 @@ from icalib.sensors.camera.assess.observation_notes import notes
 from icalib.sensors.camera.assess.residual_records import residuals
 from icalib.sensors.camera.assess.swapped import swapped_cameras
 from icalib.sensors.camera.assess.twin_lenses import ambiguities
+from icalib.sensors.camera.assess.wrong_resolution import wrong_resolutions
 from icalib.sensors.camera.spec import BLOOM
 
 __all__ = [
@@ -48,12 +49,14 @@ LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges
 def causes(
     inputs: Inputs, estimate: Estimate, groups: Sequence[ParameterGroup], factor: float, relaxed_rig: Relaxed | None
 ) -> Iterator[Cause]:
-    """Cameras that are swapped, fixed intrinsics of another camera, and camera models that do not follow the lens.
+    """Cameras that are swapped, wrong resolutions, fixed intrinsics of another camera, and camera models that do not
+    follow the lens.
 
     factor: the largest empirical factor, which multiplies formal standard deviations. relaxed_rig: None omits the test
     of fixed intrinsics.
     """
     yield from swapped_cameras(inputs.rig.cameras, groups)
+    yield from wrong_resolutions(inputs, estimate, groups)
     yield from wrong_lenses(inputs, relaxed_rig, factor)
     yield from wrong_models(inputs, estimate)
 

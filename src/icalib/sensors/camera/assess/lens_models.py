@@ -26,6 +26,7 @@ from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 from icalib.sensors.camera.corner_noise import image_flow, image_speed, residual_noise
 from icalib.sensors.camera.corner_outliers import rejected
+from icalib.sensors.camera.spec import LENS, Camera
 
 MOST_IMAGES = 40  # images of a comparison, half of them for the test; the computing time is proportional
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
@@ -91,16 +92,18 @@ def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
             f"the corners of {camera.name} are off by up to {largest:.2g} px, alike wherever in the image they are seen"
         )
         if best is not None and current is not None:
-            yield Cause(_named_model(misfit, current, best), gain)
+            yield Cause(_named_model(misfit, current, best, camera), gain)
         elif noise.lens.rms > noise.base:
             yield Cause(f"{misfit}{NO_BETTER_MODEL}", gain)
 
 
-def _named_model(misfit: str, current: _Trial, best: _Trial) -> str:
+def _named_model(misfit: str, current: _Trial, best: _Trial, camera: Camera) -> str:
     """The sentence about a `misfit` that the model `best` explains."""
+    old = " and ".join(name for name in LENS if getattr(camera, name).value is not None)
+    remove = f", and remove {old}, of {current.model.name}" if old else ""  # another model has other numbers
     return (
         f"{misfit}: {current.model.name} does not follow this lens. In images that had no part in the fit it leaves "
-        f"{current.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`."
+        f"{current.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`{remove}."
     )
 
 

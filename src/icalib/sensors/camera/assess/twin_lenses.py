@@ -31,7 +31,7 @@ def ambiguities(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)
         if camera.intrinsics.mode == "fixed" or camera.distortion.mode == "fixed" or fit is None or not fit.rms:
             continue
-        lens, uv = factor.lens(estimate.outcome.state), _observed(estimate, factor)
+        lens, uv = factor.lens(estimate.outcome.state), observed(estimate, factor)
         # `count` counts both coordinates of each point; `rms` is that of one coordinate.
         limit = fit.rms * np.sqrt(MOST_CHI2 / max(0.5 * fit.count, 1.0))
         twin = twin_lens(factor.model, lens, uv, float(limit))
@@ -63,7 +63,7 @@ def twin_lens(model: CameraModel, lens: np.ndarray, uv: np.ndarray, limit_px: fl
     return best[1]
 
 
-def _observed(estimate: Estimate, factor: CornerFactor) -> np.ndarray:
+def observed(estimate: Estimate, factor: CornerFactor) -> np.ndarray:
     """(N, 2) px: detected corners and used tracked points of a camera."""
     features = of_type(estimate.problem.factors, FeatureFactor)
     pairs = [pair for f in features for pair in zip(f.streams, f.keep, strict=True)]

@@ -70,8 +70,8 @@ CONVENTIONS: tuple[tuple[str, Conversion], ...] = (
         for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
     ),
     (
-        "have quaternions with w first; name the columns in the rig file as x, y, z, w, or correct the program "
-        "that writes them",
+        "have quaternions with w first; for a table of stamp, position and quaternion write columns: "
+        "[1, 2, 3, 4, 6, 7, 8, 5], else correct the program that writes them",
         _w_first,
     ),
 )

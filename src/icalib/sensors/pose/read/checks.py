@@ -101,7 +101,7 @@ def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[P
     if sensor.kind == "absolute" and path.net_jump_m > max(_MAX_NET_JUMP_M, _MAX_NET_JUMP_SHARE * path.size_m):
         raise RecordingError(
             f"{words}, and do not return, as if an odometry closed a loop or lost its track. Write kind: "
-            f"relative for {sensor.name} in the rig file, or cut the recording with --from and --to."
+            f"relative for {sensor.name} in the rig file, with an IMU, or cut the recording with --from and --to."
         )
     if not count:
         return read, (f"{words}; the robust loss reduces their weight.",)

@@ -49,11 +49,11 @@ REJECTION = 5.0  # median absolute residuals (3.4 standard deviations); rows wit
 # For each kind of wheels: why their yaw rate may be opposite to that of the IMU, and how to correct it.
 REVERSED_YAW: dict[WheelKind, str] = {
     "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
-    "to [-1, -1] in the rig file",
+    "to [-1, -1] (skid-steer: [-1, -1, -1, -1]) in the rig file",
     "twist": "its yaw rate must be positive to the left; set signs to [1, -1] in the rig file",
     "steered": (
         "its steering angle must be positive to the left and its wheel must turn forwards; correct the wrong sign "
-        "with signs in the rig file, [1, -1] or [-1, 1]"
+        "in the rig file: set signs to [1, -1] or to [-1, 1]"
     ),
 }
 
@@ -199,8 +199,9 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
     left, right = (_robust_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
-            f"{name}: its wheels count in opposite directions; set signs in the rig file, [1, -1] or [-1, 1], "
-            "with -1 for the wheel that counts down as the vehicle drives forwards."
+            f"{name}: its wheels count in opposite directions; set signs to [1, -1] or [-1, 1] "
+            "(skid-steer: [1, 1, -1, -1] or [-1, -1, 1, 1]) in the rig file, with -1 for the wheels that count down as "
+            "the vehicle drives forwards."
         )
     radii = np.array([1.0 / left[0], 1.0 / right[0]])
     _check_radii(name, radii)
@@ -251,7 +252,8 @@ def _steered(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> t
         offset += float(np.arctan(step))
     if base < 0.0:
         raise EstimationError(
-            f"{name}: its steering angle is positive to the right; change its sign with signs in the rig file."
+            f"{name}: its steering angle is positive to the right; set signs to [1, -1] (or to "
+            "[1, 1, -1, -1] for four joints) in the rig file."
         )
     if abs(offset) > MAX_STEERING_OFFSET_RAD or base == 0.0:
         raise EstimationError(
@@ -268,7 +270,7 @@ def _check_radii(name: str, radii: np.ndarray) -> None:
         which = " and ".join(f"{r:.3g}" for r in radii)
         raise EstimationError(
             f"{name}: its wheels would have radii of {which} m; check that it measures radians per second (not "
-            "degrees or revolutions), or set its rate_unit or counts_per_turn in the rig file."
+            "degrees or revolutions), or correct rate_unit (of rates) or counts_per_turn (of ticks) in the rig file."
         )
 
 

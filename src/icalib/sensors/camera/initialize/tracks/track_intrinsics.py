@@ -87,7 +87,7 @@ def find_intrinsics(camera: Camera, stream: TrackStream, imu: ImuData, offset: f
     if not fit.sigma < MAX_LOG_FOCAL_SIGMA:
         raise EstimationError(
             f"{camera.name}: the rotation in the recording does not determine the focal length; turn the rig "
-            "about axes perpendicular to the optical axis, or give intrinsics: [fx, fy, cx, cy] in the rig "
+            "about axes perpendicular to the optical axis, or give intrinsics: {guess: [fx, fy, cx, cy]} in the rig "
             "file."
         )
     return fit.lens if stated is not None else _in_model(camera, stream, imu, model, fit, offset is not None)
