@@ -48,7 +48,7 @@ def test_arrays_need_no_pickle(saved: Path):
 
 
 def test_yaml_says_when_and_from_what_it_was_made(calibration: Calibration):
-    span = RecordingSpan("run.bag", 0.5, 20.75, 1_700_000_000_000_000_000)
+    span = RecordingSpan("run.bag", np.float64(0.5), np.float64(20.75), 1_700_000_000_000_000_000)
     made = dataclasses.replace(calibration, made="2026-03-01T12:00:00+00:00", recordings=(span,))
     data = yaml.safe_load(calibration_yaml(made))
     assert data["date"] == "2026-03-01T12:00:00+00:00" and data["sha256"] == calibration.inputs

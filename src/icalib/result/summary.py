@@ -97,8 +97,8 @@ def _sensor(c: Calibration, name: str) -> dict[str, Any]:
 
 def _origin(c: Calibration) -> dict[str, Any]:
     """When the result was made, and from which recordings and files."""
-    recordings = [{"name": r.name, "seconds": r.end - r.start, "first_stamp_ns": r.origin_ns} for r in c.recordings]
-    return {"date": c.made or None, "recordings": recordings, "sha256": dict(c.inputs)}
+    spans = [{"name": r.name, "seconds": float(r.end - r.start), "first_stamp_ns": r.origin_ns} for r in c.recordings]
+    return {"date": c.made or None, "recordings": spans, "sha256": dict(c.inputs)}
 
 
 def _is_told(c: Calibration, g: ParameterGroup) -> bool:
