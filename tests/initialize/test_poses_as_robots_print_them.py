@@ -40,8 +40,8 @@ PRINTED = [  # numbers of a row, and the fields that read them
 
 def pose_sensor(**fields) -> PoseSensor:
     sensors = {"imu0": {"type": "imu"}, "flange": {"type": "pose", **fields}}
-    rig = rig_from_dict({"sensors": sensors})
-    assert rig_from_dict(rig_to_dict(rig)).poses == rig.poses
+    rig = rig_from_dict({"sensors": sensors}, "rig.yaml")
+    assert rig_from_dict(rig_to_dict(rig), "rig.yaml").poses == rig.poses
     return rig.poses[0]
 
 

@@ -124,17 +124,17 @@ def unstated(stream: PoseStream) -> EstimationError:
 
 def _readings(x: PoseStream, sensor: PoseSensor) -> Iterator[tuple[str | None, np.ndarray]]:
     """Rotations (N, 3, 3) read in all ways, each with its `rotations` in the rig file, or None for that of `x`."""
-    stated, size = sensor.rotations, x.numbers.shape[1]
+    size = x.numbers.shape[1]
     if not is_unstated(x, sensor):
         yield None, x.rotation
     if not size:
         yield "wxyz", _w_first(x).rotation
     if size == 4:
-        how = "xyzw" if stated == "wxyz" else "wxyz"
+        how = "xyzw" if sensor.rotations == "wxyz" else "wxyz"
         yield how, rotations_of(x.numbers, how)
     for name in THREE_NUMBERS if size == 3 else ():
         how = f"{name}, {angle_unit(x.numbers)}"
-        if how != stated:
+        if how != sensor.rotations:
             yield how, rotations_of(x.numbers, how)
 
 

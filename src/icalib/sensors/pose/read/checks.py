@@ -44,8 +44,8 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
         # The steps between stops of a robot are not jumps.
         read, single = _without_outliers(read, what)
         read, jumped = _on_trajectory(read, sensor, what)
+        _refuse_units(read, what)
     _refuse_stillness(read, what)
-    _refuse_units(read, what)
     stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position, read.numbers)
     return stream, broken + notes + copied + single + jumped
 
