@@ -28,8 +28,7 @@ POSE_TABLE = TableKind(
     ),
     POSE_RATE_HZ,
 )
-_POSITION = ("x [m]", "y [m]", "z [m]")
-_THREE = TableKind(("t [ns]",), (*_POSITION, "rx", "ry", "rz"), rate_hz=POSE_RATE_HZ)
+_THREE = TableKind(("t [ns]",), (*POSE_TABLE.decimals[:3], "rx", "ry", "rz"), rate_hz=POSE_RATE_HZ)
 # Rows of a 3 x 4 or 4 x 4 matrix one after another
 _MATRICES = tuple(
     TableKind(("t [ns]",), tuple(f"m{i}{k}" for i in range(1, rows + 1) for k in range(1, 5)), rate_hz=POSE_RATE_HZ)
