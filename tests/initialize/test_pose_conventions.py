@@ -67,9 +67,9 @@ WRONG = [
     (left_handed, "the poses of mocap0 are in left-handed axes"),
     (upside_down, "the poses of mocap0 have the z axis of the position reversed; set its position_axes to .x, y, -z."),
     (w_first, "the poses of mocap0 have quaternions with w first"),
-    (y_up, "of mocap0 are in different frames.*set position_axes of mocap0 to .x, z, -y."),
-    (cyclic, "of mocap0 are in different frames.*set position_axes of mocap0 to .z, x, y."),
-    (askew, r"of mocap0 are in different frames.*roll, pitch, yaw of -?\d, -?\d, -5\d deg would fit"),
+    (y_up, "of mocap0 have positions and rotations in different frames.*set its position_axes to .x, z, -y."),
+    (cyclic, "of mocap0 have positions and rotations in different frames.*set its position_axes to .z, x, y."),
+    (askew, r"rotations in different frames.*roll, pitch, yaw of -?\d, -?\d, -5\d deg would fit"),
 ]
 
 

@@ -145,7 +145,7 @@ def test_bad_poses(tmp_path):
         tmp_path
     )
     table(tmp_path, position=1000.0 * POSITION)
-    assert "divide millimetres by 1000" in refused(tmp_path)
+    assert "position_unit of the rig file (metres without it)" in refused(tmp_path)
     table(tmp_path, position=0.0 * POSITION, xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (N, 1)))
     assert "all poses are the same within 0 m and 0 rad" in refused(tmp_path)
     table(tmp_path, stamps=STAMPS[::-1])

@@ -66,7 +66,7 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
     try:
         return _guess(rig, recordings)
     except MotionContradictedError as error:
-        for words, converted in motion_kinds(rig)[0].rewritten(recordings):
+        for words, converted in motion_kinds(rig)[0].rewritten(rig, recordings):
             try:
                 _guess(rig, converted)
             except EstimationError:

@@ -157,10 +157,10 @@ class Initializer(Generic[S]):
         del rig, recordings, motion
         return np.inf
 
-    def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
+    def rewritten(self, rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
         """Versions of the recordings in which measurements of `sources` are converted from another convention, each
         with a sentence that names the convention. They are tried if other sensors contradict the motion."""
-        del recordings
+        del rig, recordings
         return iter(())
 
     # Errors

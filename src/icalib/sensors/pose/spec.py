@@ -26,8 +26,32 @@ from icalib.sensors.parameter_spec import ParameterSpec
 from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
 
 PoseKind = Literal["absolute", "relative"]
+LengthUnit = Literal["m", "cm", "mm"]
+METRES: dict[LengthUnit, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+# Three numbers of a rotation: a rotation vector, or angles about fixed (lower case) or turning axes (capitals).
+THREE_NUMBERS = (
+    "vector",
+    *(axes for order in ("xyz", "xzy", "yxz", "yzx", "zxy", "zyx", "zyz") for axes in (order, order.upper())),
+)
+_ROTATIONS = (
+    "xyzw",
+    "wxyz",
+    "matrix",
+    *(f"{name}, {unit}" for name in THREE_NUMBERS for unit in ("degrees", "radians")),
+)
 POSE_SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # ratio of true to reported lengths
-_FIELDS = ("path", "topic", "kind", "level", "position_axes", "inverted", "frames", "scale_sigma")
+_FIELDS = (
+    "path",
+    "topic",
+    "kind",
+    "level",
+    "position_axes",
+    "position_unit",
+    "rotations",
+    "inverted",
+    "frames",
+    "scale_sigma",
+)
 _NOISE = ("rotation_noise", "position_noise")
 
 
@@ -53,6 +77,8 @@ class PoseSensor(MountedSensor):
     position_noise: float | None = None
     level: bool = True
     position_axes: Axes | None = None  # recorded columns, with signs, that are x, y, z in the frame of the rotations
+    position_unit: LengthUnit = "m"
+    rotations: str | None = None  # how a table writes them, one of _ROTATIONS; None: quaternions x, y, z, w, or by name
     topic: str | None = None  # topic of the poses; None: the topic with the sensor's name, or the only one
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # whether the recorded poses are T_sensor_frame instead of T_frame_sensor
@@ -73,6 +99,8 @@ class PoseSensor(MountedSensor):
             path=path_or(fields, f"{name}/poses.csv"),
             kind=choice_or(fields, "kind", PoseKind, cls.kind),
             position_axes=axes_or_none(fields, "position_axes"),
+            position_unit=choice_or(fields, "position_unit", LengthUnit, cls.position_unit),
+            rotations=_rotations(fields["rotations"]) if "rotations" in fields else None,
             level=fields["level"].boolean() if "level" in fields else cls.level,
             topic=topic_or_none(fields),
             rotation_noise=fields["rotation_noise"].positive() if "rotation_noise" in fields else None,
@@ -91,6 +119,8 @@ class PoseSensor(MountedSensor):
         given = {name: getattr(self, name) for name in (*_NOISE, "topic")}
         axes, frames = self.position_axes, self.frames
         given |= {"inverted": self.inverted or None, "position_axes": None if axes is None else list(axes)}
+        given |= {"position_unit": None if self.position_unit == "m" else self.position_unit}
+        given["rotations"] = None if self.rotations is None else self.rotations.split(", ")
         given["frames"] = None if frames is None else list(frames)
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
 
@@ -122,6 +152,17 @@ def _scale_sigma(value: YamlValue) -> float:
     if not 0.0 <= (sigma := value.number()) < 1.0:
         value.fail(f"is a share of all lengths between 0 (exact) and 1, but is {sigma:g}; write 0.001 for 0.1 %.")
     return sigma
+
+
+def _rotations(value: YamlValue) -> str:
+    """How a table writes rotations, one of _ROTATIONS. Raises RigError if it is none of them."""
+    entries = [entry.text() for entry in value.items()] if value.is_list else value.text().split(",")
+    if (written := ", ".join(entry.strip() for entry in entries)) not in _ROTATIONS:
+        value.fail(
+            "must be xyzw or wxyz (quaternions), matrix, or three numbers with their unit, as in [xyz, degrees] "
+            "(angles about fixed axes), [ZYX, degrees] (about turning axes) or [vector, radians]; correct it."
+        )
+    return written
 
 
 def _frames(value: YamlValue) -> tuple[str, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -15,11 +15,13 @@ class PoseStream(Stream):
     """Measured poses of a sensor, in a frame that is static or drifts slowly.
 
     stamps_ns (N,) int64: strictly increasing; rotation (N, 3, 3): R_frame_sensor; position (N, 3): p_frame_sensor [m].
+    numbers (N, 3, 4 or 9): the rotations as a table wrote them, or (0, 0).
     """
 
     sensor_type: ClassVar[str] = "pose"
     rotation: np.ndarray
     position: np.ndarray
+    numbers: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         super().__post_init__()

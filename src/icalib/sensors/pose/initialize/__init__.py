@@ -16,7 +16,7 @@ from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.model.frames import FRAME, frame_of
 from icalib.optim.state import State
 from icalib.rig import PoseSensor, Rig
-from icalib.sensors.pose.initialize.conventions import CONVENTIONS, POSITION_AXES
+from icalib.sensors.pose.initialize.conventions import conventions, is_unstated, other_axes, unstated
 from icalib.sensors.pose.initialize.extrinsics import check_rate, pose_values, state_from_poses
 from icalib.sensors.pose.initialize.initial_noise import pose_noise
 from icalib.sensors.pose.initialize.stop_and_go import is_stop_and_go, state_from_pairs
@@ -52,6 +52,8 @@ class PoseInitializer(Initializer[PoseSensor]):
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
         streams = [m.poses[0] for m in recordings]
+        if is_unstated(streams[0], rig.poses[0]):
+            raise unstated(streams[0])
         return [BodyPoses(s.seconds, s.rotation, s.position) for s in streams], {}
 
     def check_moving(self, recording: Measurements) -> None:
@@ -70,12 +72,15 @@ class PoseInitializer(Initializer[PoseSensor]):
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         return motion.spacing_for_poses(*pose_noise([m.poses[0] for m in recordings]))
 
-    def rewritten(self, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        for words, convert in (*CONVENTIONS, *POSITION_AXES):
-            yield (
-                f"the poses of {recordings[0].poses[0].name} {words}.",
-                [m.with_streams(convert(m.poses[0])) for m in recordings],
-            )
+    def rewritten(self, rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
+        sensor = rig.poses[0]
+        each = ([*conventions(m.poses[0], sensor), *other_axes(m.poses[0])] for m in recordings)
+        for others in zip(*each, strict=True):
+            if others[0].changes == 1 and "position_unit" not in "".join(others[0].fields):
+                yield (
+                    others[0].sentence(sensor.name),
+                    [m.with_streams(x.stream) for m, x in zip(recordings, others, strict=True)],
+                )
 
     def explained(
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]

@@ -1,14 +1,14 @@
-"""Detects poses in a convention other than that of `PoseStream`.
+"""Detects poses in a convention other than that of the rig file.
 
-These are inverted poses or rotations, left-handed axes, quaternions with w first, and positions and rotations in
-different frames. Each convention is tried if the poses do not fit the motion. An error names the convention if the
-poses fit far better with it.
+These are another unit of positions, another way to write rotations, inverted poses or rotations, left-handed axes, and
+positions and rotations in different frames. If the poses do not fit the motion, all conventions are tried. An error
+names the one that fits, unless another fits as well.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -17,12 +17,15 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import PoseStream
 from icalib.data.tables.columns import in_axes
 from icalib.errors import EstimationError
-from icalib.rig import Axes
+from icalib.rig import Axes, PoseSensor
 from icalib.sensors.pose.initialize.position_frame import axes_text
+from icalib.sensors.pose.read.pose_tables import angle_unit, rotations_of
+from icalib.sensors.pose.spec import METRES, THREE_NUMBERS, LengthUnit
 
 Conversion = Callable[[PoseStream], PoseStream]  # converts poses from a convention to that of `PoseStream`
 T = TypeVar("T")
 MAX_UNEXPLAINED = 0.1  # unexplained share of the motion, up to which the convention is taken to be right
+MAX_RIVAL_RATIO = 1.5  # up to this ratio of its unexplained share to the least one, a convention fits as well
 MAX_CONVERTED_RATIO = 0.5  # ratio of converted to original unexplained share, below which a convention fits far better
 
 
@@ -54,47 +57,109 @@ def _w_first(x: PoseStream) -> PoseStream:
     return replace(x, rotation=Rotation.from_quat(w_x_y_z[:, [1, 2, 3, 0]]).as_matrix())
 
 
-CONVENTIONS: tuple[tuple[str, Conversion], ...] = (
-    (
-        "are inverted: they give the pose of the reference frame in the sensor's frame; write inverted: true for "
-        "it in the rig file",
-        _inverse,
-    ),
-    (
+@dataclass(frozen=True)
+class Convention:
+    """Poses as another convention has them. words: what they are; fields: of the rig file, that state it; changes:
+    number of differences from the rig file."""
+
+    stream: PoseStream
+    words: str
+    fields: tuple[str, ...] = ()
+    changes: int = 1
+
+    def sentence(self, name: str) -> str:
+        advice = f"; write {' and '.join(self.fields)} for it in the rig file" if self.fields else ""
+        return f"the poses of {name} {self.words}{advice}."
+
+
+UNIT_NOUNS: dict[LengthUnit, str] = {"m": "metres", "cm": "centimetres", "mm": "millimetres"}
+
+
+def conventions(stream: PoseStream, sensor: PoseSensor) -> Iterator[Convention]:
+    """Poses of `sensor` in all other conventions: combinations of unit, rotations and inversion, then single others."""
+    written = _inverse(stream) if sensor.inverted else stream
+    for how, rotation in _readings(written, sensor):
+        words, fields = ([], []) if how is None else _rotation_words(how, len(stream.numbers) > 0)
+        for unit, noun in UNIT_NOUNS.items():
+            position = written.position * (METRES[unit] / METRES[sensor.position_unit])
+            read = replace(written, rotation=rotation, position=position)
+            other = unit != sensor.position_unit
+            in_unit = [*words, *([f"are in {noun}"] if other else [])]
+            unit_fields = [*fields, *([f"position_unit: {unit}"] if other else [])]
+            if in_unit:
+                poses = _inverse(read) if sensor.inverted else read
+                yield Convention(poses, " and ".join(in_unit), tuple(unit_fields), len(in_unit))
+            turned = read if sensor.inverted else _inverse(read)
+            every = " and ".join([*in_unit, _NOT_INVERTED if sensor.inverted else _INVERTED])
+            turned_fields = (*unit_fields, f"inverted: {'false' if sensor.inverted else 'true'}")
+            yield Convention(turned, every, turned_fields, len(in_unit) + 1)
+    yield Convention(
+        _with_inverse_rotations(stream),
         "have inverted rotations; write R_frame_sensor, or change the signs of x, y, z of the quaternions",
-        _with_inverse_rotations,
-    ),
-    ("are in left-handed axes; write them in right-handed axes", _with_y_reversed),
-    *(
-        (f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}", _with_axis_reversed(k))
-        for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]"))
-    ),
-    (
-        "have quaternions with w first; for a table of stamp, position and quaternion write columns: "
-        "[1, 2, 3, 4, 6, 7, 8, 5], else correct the program that writes them",
-        _w_first,
-    ),
-)
-
-
-def _with_axes(axes: Axes) -> Conversion:
-    """A conversion that exchanges axes of the positions."""
-    return lambda x: replace(x, position=in_axes(x.position, axes))
-
-
-# One convention for each direction of the vertical, as planar motion of a vehicle does not distinguish any more.
-POSITION_AXES: tuple[tuple[str, Conversion], ...] = tuple(
-    (
-        "have positions and rotations in different frames, for example one with z up and the other with y up; "
-        f"set its position_axes to [{', '.join(axes)}]",
-        _with_axes(axes),
     )
-    for axes in (("x", "z", "-y"), ("x", "-z", "y"), ("y", "z", "x"), ("z", "x", "y"))
-)
+    yield Convention(_with_y_reversed(stream), "are in left-handed axes; write them in right-handed axes")
+    if not sensor.inverted and sensor.position_axes is None:  # position_axes are those of the poses as written
+        for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]")):
+            words = f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}"
+            yield Convention(_with_axis_reversed(k)(stream), words)
+
+
+_INVERTED = "are inverted: they give the pose of the reference frame in the sensor's frame"
+_NOT_INVERTED = "are not inverted: they give the pose of the sensor in the reference frame"
+
+
+def is_unstated(stream: PoseStream, sensor: PoseSensor) -> bool:
+    """Whether the table writes a rotation as three numbers, and the rig file does not tell how."""
+    return sensor.rotations is None and stream.numbers.shape[1] == 3
+
+
+def unstated(stream: PoseStream) -> EstimationError:
+    """The error for poses of which `is_unstated` is true, and whose motion does not show the convention."""
+    return EstimationError(
+        f"{stream.name}: three numbers give each rotation, and the motion does not show how they are written; write "
+        "rotations: [xyz, degrees] (angles about fixed axes), [ZYX, degrees] (about turning axes) or [vector, radians] "
+        "for it in the rig file."
+    )
+
+
+def _readings(x: PoseStream, sensor: PoseSensor) -> Iterator[tuple[str | None, np.ndarray]]:
+    """Rotations (N, 3, 3) read in all ways, each with its `rotations` in the rig file, or None for that of `x`."""
+    size = x.numbers.shape[1]
+    if not is_unstated(x, sensor):
+        yield None, x.rotation
+    if not size:
+        yield "wxyz", _w_first(x).rotation
+    if size == 4:
+        how = "xyzw" if sensor.rotations == "wxyz" else "wxyz"
+        yield how, rotations_of(x.numbers, how)
+    for name in THREE_NUMBERS if size == 3 else ():
+        how = f"{name}, {angle_unit(x.numbers)}"
+        if how != sensor.rotations:
+            yield how, rotations_of(x.numbers, how)
+
+
+def _rotation_words(how: str, in_table: bool) -> tuple[list[str], list[str]]:
+    """What poses have whose rotations are written as `how`, and the field of the rig file that says so."""
+    if not in_table:
+        return ["have quaternions with w first (correct the program that sends them)"], []
+    if how in ("wxyz", "xyzw"):
+        return [f"have quaternions with w {'first' if how == 'wxyz' else 'last'}"], [f"rotations: {how}"]
+    return [f"have rotations written as [{how}]"], [f"rotations: [{how}]"]
+
+
+def other_axes(stream: PoseStream) -> Iterator[Convention]:
+    """Poses with exchanged axes of positions. One convention for each direction of the vertical, as planar motion of a
+    vehicle does not distinguish any more."""
+    axes: Axes
+    for axes in (("x", "z", "-y"), ("x", "-z", "y"), ("y", "z", "x"), ("z", "x", "y")):
+        words = "have positions and rotations in different frames, for example one with z up and the other with y up"
+        exchanged = replace(stream, position=in_axes(stream.position, axes))
+        yield Convention(exchanged, f"{words}; set its position_axes to [{', '.join(axes)}]")
 
 
 def with_checked_convention(
     stream: PoseStream,
+    sensor: PoseSensor,
     place: Callable[[PoseStream], tuple[T, float]],
     rotation_of: Callable[[PoseStream], np.ndarray | None] = lambda stream: None,
 ) -> T:
@@ -102,7 +167,7 @@ def with_checked_convention(
 
     place: returns its result, and the share of the motion that the poses do not explain. rotation_of: a candidate
     rotation (3, 3) from the frame of positions to that of rotations, or None. Raises EstimationError as `place` does,
-    or if the poses fit far better with another convention.
+    or if the poses fit with another convention, and far better than in that of the rig file.
     """
     result: T | None = None
     failed: EstimationError | None = None
@@ -111,41 +176,48 @@ def with_checked_convention(
         result, unexplained = place(stream)
     except EstimationError as error:
         failed = error
-    if unexplained > MAX_UNEXPLAINED:
-        most = MAX_CONVERTED_RATIO * unexplained
-        _refuse_two_frames(stream, place, rotation_of, most)
-        for words, convert in CONVENTIONS:
-            if _unexplained(place, convert(stream)) < most:
-                raise EstimationError(f"the poses of {stream.name} {words}.") from failed
+    open_ = is_unstated(stream, sensor)
+    if unexplained > MAX_UNEXPLAINED or open_:
+        others = [*_in_two_frames(stream, rotation_of), *conventions(stream, sensor)]
+        most = MAX_UNEXPLAINED if open_ else min(MAX_UNEXPLAINED, MAX_CONVERTED_RATIO * unexplained)
+        best = best_convention(others, [_unexplained(place, x.stream) for x in others], most)
+        if best is not None:
+            raise EstimationError(best.sentence(stream.name)) from failed
+        if open_:
+            raise unstated(stream) from failed
     if result is None:
         assert failed is not None
         raise failed
     return result
 
 
-def _refuse_two_frames(
-    stream: PoseStream,
-    place: Callable[[PoseStream], tuple[T, float]],
-    rotation_of: Callable[[PoseStream], np.ndarray | None],
-    most: float,
-) -> None:
-    """Raise EstimationError if rotating the positions reduces the unexplained share of the motion below `most`."""
+def best_convention(others: list[Convention], shares: list[float], most: float) -> Convention | None:
+    """The convention with the least unexplained share of the motion; None if it is not below `most`, or if another one
+    with as few changes explains as much."""
+    least = min(shares)
+    rivals = [x for x, share in zip(others, shares, strict=True) if share <= MAX_RIVAL_RATIO * least]
+    fewest = [x for x in rivals if x.changes == min(r.changes for r in rivals)]
+    return fewest[0] if least < most and len(fewest) == 1 else None
+
+
+def _in_two_frames(stream: PoseStream, rotation_of: Callable[[PoseStream], np.ndarray | None]) -> Iterator[Convention]:
+    """Poses whose positions are turned into the frame of the rotations, if `rotation_of` finds such a rotation."""
     try:
         C = rotation_of(stream)
     except EstimationError:
         return
-    if C is None or not _unexplained(place, replace(stream, position=stream.position @ C.T)) < most:
+    if C is None:
         return
     axes = axes_text(C)
     degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
-    raise EstimationError(
-        f"the positions and rotations of {stream.name} are in different frames, for example one with z up and "
-        "the other with y "
+    yield Convention(
+        replace(stream, position=stream.position @ C.T),
+        "have positions and rotations in different frames, for example one with z up and the other with y up; "
         + (
-            f"up; set position_axes of {stream.name} to {axes} in the rig file."
+            f"set its position_axes to {axes}"
             if axes
-            else f"up: positions turned by roll, pitch, yaw of {degrees} deg would fit; write both in one frame."
-        )
+            else f"positions turned by roll, pitch, yaw of {degrees} deg would fit; write both in one frame"
+        ),
     )
 
 

@@ -91,14 +91,14 @@ def _aligned_values(inputs: Inputs, state: State, sensor: PoseSensor, stream: Po
         known = {"known": state, "extrinsics": extrinsics}
         rotation_of = partial(_position_rotation_on_trajectory, inputs.imu, **known)
         place = partial(_fit_to_trajectory, inputs.imu, **known)
-        return with_checked_convention(stream, place, rotation_of).values(sensor.name)
+        return with_checked_convention(stream, sensor, place, rotation_of).values(sensor.name)
     streams = [_imu_and_poses(inputs, k, sensor.name) for k in range(len(inputs.parts))]
     k = fullest_recording(inputs, sensor.name)
     imu, poses = streams[k]
     with naming_recording(inputs, k):
         known = {"known": state_of_recording(inputs, k, state), "extrinsics": extrinsics}
         rotation_of = partial(_position_rotation_on_trajectory, imu, **known)
-        guess = with_checked_convention(poses, partial(_fit_to_trajectory, imu, **known), rotation_of)
+        guess = with_checked_convention(poses, sensor, partial(_fit_to_trajectory, imu, **known), rotation_of)
 
     def offset(recording: int) -> float:
         return _aligned(*streams[recording], KnownExtrinsics(guess.rotation))[0].offset
@@ -131,7 +131,10 @@ def _single_state(inputs: Inputs, extrinsics: KnownExtrinsics | None) -> State:
     sensor, stream, imu, gravity = inputs.rig.poses[0], inputs.measurements.poses[0], inputs.imu, inputs.rig.gravity
     known = extrinsics or known_extrinsics(inputs, sensor)
     fit = with_checked_convention(
-        stream, lambda x: _fit_to_imu(imu, x, gravity, known), lambda x: _position_rotation_by_imu(imu, x, known)
+        stream,
+        sensor,
+        lambda x: _fit_to_imu(imu, x, gravity, known),
+        lambda x: _position_rotation_by_imu(imu, x, known),
     )
     mounted = merged_values(sensor, stated_values(inputs, sensor), fit.guess.values(sensor.name))
     values = start_values(inputs, mounted)

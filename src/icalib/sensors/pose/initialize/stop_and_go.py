@@ -144,7 +144,7 @@ def _with_extrinsics(
 def _with_inliers(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.ndarray, m: Measurements) -> Measurements:
     """The recording with the paired poses of one sensor, except the outliers `bad` (n,) bool, and with notes."""
     good = np.flatnonzero(~bad)
-    columns = {name: getattr(paired.stream, name)[good] for name in ("stamps_ns", "rotation", "position")}
+    columns = {"stamps_ns": paired.stream.stamps_ns[good], **_rows(paired.stream, good)}
     notes = (*m.notes, *_notes(rig, sensor, paired, bad, m))
     return replace(m.with_streams(replace(paired.stream, **columns)), notes=notes)
 
@@ -179,9 +179,14 @@ def _paired_poses(rig: Rig, sensor: PoseSensor, m: Measurements, stream: PoseStr
             f"{counts[0]} of {rig.reference}, and {MIN_POSE_PAIRS} are needed; {ADVICE}."
         )
     stamps = m.origin_ns + np.round((body.seconds[i] - offset) * 1e9).astype(np.int64)
-    chosen = replace(stream, stamps_ns=stamps, rotation=stream.rotation[k], position=stream.position[k])
+    chosen = replace(stream, stamps_ns=stamps, **_rows(stream, k))
     pairs = PosePairs(body.rotation[i], body.position[i], chosen.rotation, chosen.position)
     return _PairedPoses(pairs, chosen, counts)
+
+
+def _rows(stream: PoseStream, which: np.ndarray) -> dict[str, np.ndarray]:
+    """Rows of all arrays of a stream but its stamps."""
+    return {name: values[which] for name, values in stream.columns().items() if len(values)}
 
 
 def _hand_eye(rig: Rig, sensor: PoseSensor, paired: _PairedPoses) -> HandEye:
@@ -199,7 +204,7 @@ def _hand_eye(rig: Rig, sensor: PoseSensor, paired: _PairedPoses) -> HandEye:
         unexplained = unexplained_motion(pairs, solution)
         return (solution, unexplained), unexplained
 
-    solution, unexplained = with_checked_convention(paired.stream, place)
+    solution, unexplained = with_checked_convention(paired.stream, sensor, place)
     if unexplained > MAX_UNEXPLAINED_MOTION:
         turns = relative_motions(paired.pairs)
         by_body, by_sensor = (

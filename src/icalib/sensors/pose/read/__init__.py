@@ -16,6 +16,7 @@ from icalib.errors import RecordingError
 from icalib.sensors.pose.read.checks import checked_poses
 from icalib.sensors.pose.read.pose_tables import (
     POSE_TABLE,
+    POSE_TABLES,
     PoseReadings,
     as_frame_sensor,
     is_tum_text,
@@ -53,7 +54,7 @@ def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
 
 def _is_one(path: Path) -> bool:
     """Whether a file named `poses.csv` contains poses, as tables of other sensors may have this name."""
-    return is_tum_text(path) or holds(path, POSE_TABLE)
+    return is_tum_text(path) or any(holds(path, kind) for kind in POSE_TABLES)
 
 
 def _is_tum(path: Path) -> bool:
@@ -61,7 +62,7 @@ def _is_tum(path: Path) -> bool:
     if path.stem == "poses":
         return False
     try:
-        return len(read_pose_file(path.stem, path).stamps_ns) > 1
+        return holds(path, POSE_TABLE) and len(read_pose_file(path.stem, path).stamps_ns) > 1
     except RecordingError:
         return False
 
@@ -100,7 +101,9 @@ def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
         return read_transform_poses(recording, sensor, recording.note)
     if _is_table(recording, sensor):
         path = recording.table(sensor, sensor.path)
-        return recording.inside(read_pose_file(sensor.name, path, sensor.layout, recording.note), path)
+        return recording.inside(
+            read_pose_file(sensor.name, path, sensor.layout, recording.note, sensor.rotations), path
+        )
     topic = _topic(recording, sensor)
     poses = read_odometry(recording, topic.name).pose if topic.kind == "odometry" else read_poses(recording, topic.name)
     order = recording.by_stamp(topic.name, poses.stamps_ns)

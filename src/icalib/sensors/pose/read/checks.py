@@ -44,9 +44,9 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
         # The steps between stops of a robot are not jumps.
         read, single = _without_outliers(read, what)
         read, jumped = _on_trajectory(read, sensor, what)
+        _refuse_units(read, what)
     _refuse_stillness(read, what)
-    _refuse_units(read, what)
-    stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position)
+    stream = PoseStream(read.name, read.stamps_ns, np.ascontiguousarray(read.rotation), read.position, read.numbers)
     return stream, broken + notes + copied + single + jumped
 
 
@@ -128,8 +128,8 @@ def _refuse_units(read: PoseReadings, what: str) -> None:
     speed = float(np.median(np.linalg.norm(np.diff(read.position, axis=0), axis=1) / step))
     if speed > _MAX_SPEED:
         raise RecordingError(
-            f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in metres (divide "
-            "millimetres by 1000), and stamps in nanoseconds."
+            f"{what}: it moves at {speed:.4g} m/s, which is implausible. Positions must be in the "
+            "position_unit of the rig file (metres without it), and stamps in its time_unit."
         )
 
 
