@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from tests.typed import StandIn, instance
+from tests.typed import instance
 
 import icalib
 from icalib.base.yaml_nodes import YamlValue, parse_yaml
@@ -229,5 +229,6 @@ def test_another_camera_model_does_not_keep_the_numbers_of_the_old_one(
     fields = {**CAMERA, **({"intrinsics": {"guess": [400, 400, 320, 240]}} if given else {})}
     camera = Camera.parse("cam0", parse_yaml(yaml.safe_dump({"type": "camera", **fields}), "rig.yaml"))
     monkeypatch.setattr(_Trial, "rms", 0.2)
-    old, new = (_Trial(camera_model(name), StandIn(), StandIn()) for name in ("pinhole-radtan", "eucm"))
+    no_fit: Any = None
+    old, new = (_Trial(camera_model(name), no_fit, no_fit) for name in ("pinhole-radtan", "eucm"))
     assert _named_model("", old, new, camera).endswith(f"write `model: eucm`{rest}")
