@@ -14,14 +14,12 @@ from tests.typed import instance
 
 import icalib
 from icalib.base.yaml_nodes import YamlValue, parse_yaml
-from icalib.data.tables.columns import places_given
 from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
 from icalib.rig.file.targets import target_of
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.camera.assess.lens_models import _named_model, _Trial
 from icalib.sensors.camera.spec import Camera
-from icalib.sensors.pose.read.pose_tables import POSE_TABLE
 
 SOURCE = Path(icalib.__file__).parent
 OTHER_FILES = ("tools/simulation", "export", "report", "cli")  # these write or read other files, or are help texts
@@ -48,6 +46,10 @@ TARGETS: list[dict[str, Any]] = [
 # What the expressions in f-strings stand for. An expression of a new message joins the list.
 EXAMPLES = {
     "axes": "[-x, y, z]",
+    "how": "xyz, degrees",
+    "order": "wxyz",
+    "length_unit": "mm",
+    "'false' if sensor.inverted else 'true'": "true",
     "', '.join(axes)": "x, -z, y",
     "best.model.name": "eucm",
     "turned[0]": "7",
@@ -203,13 +205,6 @@ def test_a_field_that_a_message_names_is_accepted(module: str, field: str, value
     kinds = [kind for kind in SENSOR_TYPES if field in FIELDS[kind]]
     own = [kind for kind in kinds if module.startswith(f"sensors/{kind}/")]
     assert not complaints(own or kinds, field, _read(value)), f"{module}: {field}: {value}"
-
-
-def test_columns_for_quaternions_with_w_first_read_them():
-    """The message on quaternions with w first names columns that put w behind x, y, z."""
-    (columns,) = [v for m, f, v in advice() if f == "columns" and m == "sensors/pose/initialize/conventions.py"]
-    place = places_given(POSE_TABLE, (), tuple(str(k) for k in _read(columns)), 8)
-    assert list(place) == [0, 1, 2, 3, 7, 4, 5, 6]
 
 
 def test_signs_for_each_drive_are_named():

@@ -17,9 +17,8 @@ from icalib.sensors.camera.corner_factor import CornerFactor
 # Principal point over the middle of the stated image. Lenses are centred to a tenth of the image; half the resolution
 # (binning, or a scaled stream) gives 0.5.
 OFF_CENTRE = 0.75
-BEYOND = (
-    1.1  # of twice the principal point: observations beyond it show that the image is larger, so that it was cropped
-)
+# Of twice the principal point: observations beyond it show that the image is larger, so that it was cropped.
+BEYOND = 1.1
 KNOWN = 0.02  # largest standard deviation of the principal point over the size of the image
 
 
@@ -31,10 +30,10 @@ def wrong_resolutions(inputs: Inputs, estimate: Estimate, groups: Sequence[Param
         if g is None or not len(uv):
             continue
         if (size := smaller_image(camera.resolution, g.value[2:4], g.std[2:4], uv)) is not None:
-            stated, shown = (f"{width} x {height}" for width, height in (camera.resolution, size))
+            stated, apparent = (f"{width} x {height}" for width, height in (camera.resolution, size))
             sentence = (
                 f"the resolution of {camera.name} is wrong: its principal point and all observations are those of "
-                f"images of about {shown} px, not {stated}. Correct its resolution in the rig file."
+                f"images of about {apparent} px, not {stated}. Correct its resolution in the rig file."
             )
             yield Cause(sentence, np.inf, True)
 
@@ -45,9 +44,9 @@ def smaller_image(
     """(width, height) px of the images that the data show, if they are smaller than `resolution`; else None.
 
     centre, std (2,): principal point and its standard deviations. uv (N, 2): all observations. Units are px."""
-    stated, shown = np.array(resolution), 2.0 * centre + 1.0
-    small = (shown < OFF_CENTRE * stated) & (std < KNOWN * stated) & (uv.max(axis=0) < BEYOND * shown)
+    stated, apparent = np.array(resolution), 2.0 * centre + 1.0
+    small = (apparent < OFF_CENTRE * stated) & (std < KNOWN * stated) & (uv.max(axis=0) < BEYOND * apparent)
     if not small.any():
         return None
-    width, height = np.where(small, shown, stated).round().astype(int).tolist()
+    width, height = np.where(small, apparent, stated).round().astype(int).tolist()
     return width, height

@@ -80,12 +80,12 @@ def conventions(stream: PoseStream, sensor: PoseSensor) -> Iterator[Convention]:
     written = _inverse(stream) if sensor.inverted else stream
     for how, rotation in _readings(written, sensor):
         words, fields = ([], []) if how is None else _rotation_words(how, len(stream.numbers) > 0)
-        for unit, noun in UNIT_NOUNS.items():
-            position = written.position * (METRES[unit] / METRES[sensor.position_unit])
+        for length_unit, noun in UNIT_NOUNS.items():
+            position = written.position * (METRES[length_unit] / METRES[sensor.position_unit])
             read = replace(written, rotation=rotation, position=position)
-            other = unit != sensor.position_unit
+            other = length_unit != sensor.position_unit
             in_unit = [*words, *([f"are in {noun}"] if other else [])]
-            unit_fields = [*fields, *([f"position_unit: {unit}"] if other else [])]
+            unit_fields = [*fields, *([f"position_unit: {length_unit}"] if other else [])]
             if in_unit:
                 poses = _inverse(read) if sensor.inverted else read
                 yield Convention(poses, " and ".join(in_unit), tuple(unit_fields), len(in_unit))
@@ -143,7 +143,8 @@ def _rotation_words(how: str, in_table: bool) -> tuple[list[str], list[str]]:
     if not in_table:
         return ["have quaternions with w first (correct the program that sends them)"], []
     if how in ("wxyz", "xyzw"):
-        return [f"have quaternions with w {'first' if how == 'wxyz' else 'last'}"], [f"rotations: {how}"]
+        order, place = how, "first" if how == "wxyz" else "last"
+        return [f"have quaternions with w {place}"], [f"rotations: {order}"]
     return [f"have rotations written as [{how}]"], [f"rotations: [{how}]"]
 
 

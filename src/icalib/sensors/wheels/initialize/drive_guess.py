@@ -199,9 +199,9 @@ def _pair(name: str, w: np.ndarray, ahead: np.ndarray, rate: np.ndarray) -> tupl
     left, right = (_robust_fit(np.column_stack([ahead, w]), rate[:, k]) for k in range(2))
     if left[0] <= 0.0 or right[0] <= 0.0:
         raise EstimationError(
-            f"{name}: its wheels count in opposite directions; set signs to [1, -1] or [-1, 1] "
-            "(skid-steer: [1, 1, -1, -1] or [-1, -1, 1, 1]) in the rig file, with -1 for the wheels that count down as "
-            "the vehicle drives forwards."
+            f"{name}: its wheels count in opposite directions; in the rig file set signs to [1, -1] or [-1, 1]. "
+            "A skid-steer drive needs [1, 1, -1, -1] or [-1, -1, 1, 1]. -1 is for wheels that count down as the "
+            "vehicle drives forwards."
         )
     radii = np.array([1.0 / left[0], 1.0 / right[0]])
     _check_radii(name, radii)
