@@ -58,7 +58,8 @@ def test_yaml_says_when_and_from_what_it_was_made(calibration: Calibration):
 
 def test_yaml_has_no_zeros_of_an_ideal_imu(calibration: Calibration):
     group = calibration.group_or_none("imu0", "intrinsics")
-    ideal = ParameterGroup("imu0", "intrinsics", ("a", "b"), "", *[np.zeros(2)] * 3, ("fixed",) * 2, "fixed")
+    zeros = np.zeros(2)
+    ideal = ParameterGroup("imu0", "intrinsics", ("a", "b"), "", zeros, zeros, zeros, ("fixed",) * 2, "fixed")
     groups = (*(g for g in calibration.groups if g is not group), ideal)
     imu = yaml.safe_load(calibration_yaml(dataclasses.replace(calibration, groups=groups)))["sensors"]["imu0"]
     assert imu["parameters"] == imu["std"]["parameters"] == imu["verdict"]["parameters"] == {}
