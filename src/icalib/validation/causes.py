@@ -106,7 +106,7 @@ def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeli
     kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
     if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
         words = _change_words(alike, segments, timeline)
-        share = f" This explains {min(best.gain / spread.gain, 1.0):.0%} of what varies over the recording."
+        share = f" This explains {best.gain / spread.gain:.0%} of what varies over the recording."
         yield Cause(words + share, best.gain, misfit.is_grave or _is_large(best, segments))
 
 

@@ -26,6 +26,7 @@ from icalib.sensors.sensor import TIME_OFFSET
 # information in tolerance units (sigma of 1000 tolerances): keeps the form positive definite if unobservable
 RIDGE_INFORMATION = 1e-6
 Pattern = Literal["drift", "step", "pulse"]
+ROUNDING = 1.001
 SIGNIFICANT = 25.0  # gain for each parameter: five standard deviations, because many boundaries are tried
 
 
@@ -60,16 +61,17 @@ class Change:
 @dataclass(frozen=True)
 class Scatter:
     """What separate parameters for each segment gain. gain: decrease of chi^2; dof: number of their directions that
-    are determined."""
+    the segment shows."""
 
     gain: float
-    dof: int
+    dof: float
 
     def exceeded_by(self, change: Change) -> bool:
-        """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves."""
-        rest = max(self.gain - change.gain, 0.0) / max(self.dof - change.count, 1)
-        least = SIGNIFICANT * change.count * max(rest, 1.0)
-        return change.count > 0 and change.gain > least and change.gain - change.rival > SIGNIFICANT * max(rest, 1.0)
+        """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves. One
+        that gains more than separate parameters is none: it moves what no segment shows, as a frame that drifts."""
+        rest = max((self.gain - change.gain) / max(self.dof - change.count, 1.0), 1.0)
+        leads = change.gain > SIGNIFICANT * change.count * rest and change.gain - change.rival > SIGNIFICANT * rest
+        return change.count > 0 and leads and change.gain <= ROUNDING * self.gain
 
 
 def changes(parts: Segments, sensors: Sequence[Sensor]) -> tuple[Change, ...]:
@@ -86,14 +88,16 @@ def changes(parts: Segments, sensors: Sequence[Sensor]) -> tuple[Change, ...]:
 
 
 def scatter(parts: Segments) -> Scatter:
-    """Gain of separate calibration parameters for each segment, in directions that it determines."""
+    """Gain of separate calibration parameters for each segment."""
     t = parts.problem.tolerance
     free = complement(parts.problem.fixed_directions, len(t))
-    solved = [
-        _Solved.of(free.T @ (t[:, None] * sums[:-1, :-1] * t) @ free, free.T @ (t * sums[:-1, -1]))
-        for sums in parts.sums
-    ]
-    return Scatter(sum(s.gain for s in solved), sum(s.dof for s in solved))
+    gain = dof = 0.0
+    for sums in parts.sums:
+        values, vectors = np.linalg.eigh(free.T @ (t[:, None] * sums[:-1, :-1] * t) @ free)
+        information, along = np.maximum(values, 0.0), vectors.T @ (free.T @ (t * sums[:-1, -1]))
+        gain += float((along**2 / (information + RIDGE_INFORMATION)).sum())
+        dof += float((information / (information + RIDGE_INFORMATION)).sum())
+    return Scatter(gain, dof)
 
 
 def _candidates(parts: Segments, sensors: Sequence[Sensor]) -> Iterator[Candidate]:
