@@ -23,7 +23,7 @@ def test_the_change_is_that_of_a_joint_solve():
     rng = np.random.default_rng(0)
     gradient = 10.0 * rng.standard_normal((G, B))
     tested, information = form(10.0 * rng.standard_normal((G, 30, B)), gradient)
-    change = tested.change(CANDIDATE, PATTERN)
+    change = tested.seen_by(CANDIDATE).change(PATTERN)
     cross = np.einsum("g,gij->ij", PATTERN, information)[:, COLUMNS]
     changed = np.einsum("g,gij->ij", PATTERN**2, information)[np.ix_(COLUMNS, COLUMNS)]
     inverse = np.linalg.inv(np.block([[information.sum(axis=0), cross], [cross.T, changed]]))
@@ -39,7 +39,7 @@ def test_a_direction_that_nothing_shows_does_not_change():
     J[:, :, 2] = 0.0
     tested, information = form(J, gradient)
     information[:, 2, 2] = -1e-4
-    change = tested.change(CANDIDATE, PATTERN)
+    change = tested.seen_by(CANDIDATE).change(PATTERN)
     assert np.isfinite(change.std).all() and np.abs(change.step).max() < 0.1 and change.gain >= 0.0
     assert np.abs(change.step[2]) < 1e-3 * change.std[2]
 
@@ -50,7 +50,7 @@ def test_a_direction_that_the_data_hardly_determine_does_not_change():
     J, gradient = 10.0 * rng.standard_normal((G, 30, B)), 10.0 * rng.standard_normal((G, B))
     J[:, :, 1] *= 1e-4
     tested, _ = form(J, gradient)
-    change = tested.change(CANDIDATE, PATTERN)
+    change = tested.seen_by(CANDIDATE).change(PATTERN)
     assert change.dof == 2 and abs(change.step[1]) < 1e-2 and change.std[1] > 9.9
 
 

@@ -26,7 +26,7 @@ from icalib.sensors.sensor import TIME_OFFSET
 # information in tolerance units (sigma of 1000 tolerances): keeps the form positive definite if unobservable
 RIDGE_INFORMATION = 1e-6
 Pattern = Literal["drift", "step", "pulse"]
-ROUNDING = 1.001
+ROUNDING = 1.001  # of the gain of separate parameters, which bounds that of a change
 SIGNIFICANT = 25.0  # gain for each parameter: five standard deviations, because many boundaries are tried
 
 
@@ -121,8 +121,9 @@ def _candidates(parts: Segments, sensors: Sequence[Sensor]) -> Iterator[Candidat
 
 def _tested(parts: Segments, form: _Form, candidate: Candidate) -> Iterator[Change]:
     """Yields the drift, all steps and all pulses of a candidate."""
+    candidate_form = form.seen_by(candidate)
     for kind, second, pattern in _patterns(parts.state.seconds[parts.ends]):
-        one = form.change(candidate, pattern)
+        one = candidate_form.change(pattern)
         value, sigma = candidate.unit * one.step, candidate.unit * one.std
         yield Change(candidate.sensors, candidate.name, kind, second, value, sigma, one.gain, one.dof)
 
@@ -177,10 +178,26 @@ class _Form:
             information, t * parts.sums[:, :-1, -1], free @ vectors / np.sqrt(np.maximum(values, RIDGE_INFORMATION))
         )
 
-    def change(self, candidate: Candidate, pattern: np.ndarray) -> _Solved:
-        """The change of a candidate by `pattern` (G,), estimated together with a common step of all parameters."""
+    def seen_by(self, candidate: Candidate) -> _CandidateForm:
+        """The form in the directions of a candidate, which all patterns share."""
         D = candidate.directions
-        cross = D.T @ np.einsum("g,gij->ij", pattern, self.information) @ self.root
-        changed = D.T @ np.einsum("g,gij->ij", pattern**2, self.information) @ D
-        gradient = D.T @ (pattern @ self.gradient) - cross @ (self.root.T @ self.gradient.sum(axis=0))
-        return _Solved.of(changed - cross @ cross.T, gradient)
+        rows = D.T @ self.information
+        common = self.root.T @ self.gradient.sum(axis=0)
+        return _CandidateForm(rows @ D, rows @ self.root, self.gradient @ D, common)
+
+
+@dataclass(frozen=True)
+class _CandidateForm:
+    """Quadratic forms of the segments in the n directions of a candidate. information (G, n, n), gradient (G, n): of
+    its directions; cross (G, n, r): with the common step, whose gradient is common (r,)."""
+
+    information: np.ndarray
+    cross: np.ndarray
+    gradient: np.ndarray
+    common: np.ndarray
+
+    def change(self, pattern: np.ndarray) -> _Solved:
+        """The change by `pattern` (G,), estimated together with a common step of all parameters."""
+        cross = np.einsum("g,gir->ir", pattern, self.cross)
+        changed = np.einsum("g,gij->ij", pattern**2, self.information)
+        return _Solved.of(changed - cross @ cross.T, pattern @ self.gradient - cross @ self.common)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TypeGuard
 
 from icalib.base.input_files import regular
 from icalib.base.suggestion import suggestion
@@ -33,12 +34,12 @@ def compare_files(
     """
     frames = frames or {}
     a, b = (x if isinstance(x, Calibration) else Path(x) for x in (a, b))
-    if isinstance(a, Path) and isinstance(b, Path) and _is_urdf(a) and _is_urdf(b):
+    if _is_urdf(a) and _is_urdf(b):
         one, other = side_of_urdf_alone(a, b, frames), side_of_urdf_alone(b, a, frames)
-    elif isinstance(a, Path) and _is_urdf(a):
+    elif _is_urdf(a):
         other = _side(b)
         one = _beside(a, other, frames)
-    elif isinstance(b, Path) and _is_urdf(b):
+    elif _is_urdf(b):
         one = _side(a)
         other = _beside(b, one, frames)
     else:
@@ -87,7 +88,9 @@ def _side(path: Path | Calibration) -> Side:
     )
 
 
-def _is_urdf(path: Path) -> bool:
+def _is_urdf(path: Path | Calibration) -> TypeGuard[Path]:
+    if isinstance(path, Calibration):
+        return False
     if path.suffix in (".urdf", ".xacro"):
         return True
     try:

@@ -22,7 +22,6 @@ from icalib.sensors.pose.initialize.position_frame import axes_text
 from icalib.sensors.pose.read.pose_tables import angle_unit, rotations_of
 from icalib.sensors.pose.spec import METRES, THREE_NUMBERS, LengthUnit
 
-Conversion = Callable[[PoseStream], PoseStream]  # converts poses from a convention to that of `PoseStream`
 T = TypeVar("T")
 MAX_UNEXPLAINED = 0.1  # unexplained share of the motion, up to which the convention is taken to be right
 MAX_RIVAL_RATIO = 1.5  # up to this ratio of its unexplained share to the least one, a convention fits as well
@@ -46,9 +45,9 @@ def _with_y_reversed(x: PoseStream) -> PoseStream:
     return replace(x, rotation=flip[:, None] * x.rotation * flip, position=flip * x.position)
 
 
-def _with_axis_reversed(axis: int) -> Conversion:
-    """A conversion that reverses one axis of the positions."""
-    return lambda x: replace(x, position=x.position * np.where(np.arange(3) == axis, -1.0, 1.0))
+def _with_axes(x: PoseStream, axes: Axes) -> PoseStream:
+    """Poses whose positions have other axes."""
+    return replace(x, position=in_axes(x.position, axes))
 
 
 def _w_first(x: PoseStream) -> PoseStream:
@@ -99,12 +98,14 @@ def conventions(stream: PoseStream, sensor: PoseSensor) -> Iterator[Convention]:
     )
     yield Convention(_with_y_reversed(stream), "are in left-handed axes; write them in right-handed axes")
     if not sensor.inverted and sensor.position_axes is None:  # position_axes are those of the poses as written
-        for k, axes in enumerate(("[-x, y, z]", "[x, -y, z]", "[x, y, -z]")):
-            words = f"have the {'xyz'[k]} axis of the position reversed; set its position_axes to {axes}"
-            yield Convention(_with_axis_reversed(k)(stream), words)
+        axes: Axes
+        for name, axes in zip("xyz", (("-x", "y", "z"), ("x", "-y", "z"), ("x", "y", "-z")), strict=True):
+            words = f"have the {name} axis of the position reversed; set its position_axes to [{', '.join(axes)}]"
+            yield Convention(_with_axes(stream, axes), words)
 
 
 _INVERTED = "are inverted: they give the pose of the reference frame in the sensor's frame"
+_TWO_FRAMES = "have positions and rotations in different frames, for example one with z up and the other with y up"
 _NOT_INVERTED = "are not inverted: they give the pose of the sensor in the reference frame"
 
 
@@ -153,9 +154,8 @@ def other_axes(stream: PoseStream) -> Iterator[Convention]:
     vehicle does not distinguish any more."""
     axes: Axes
     for axes in (("x", "z", "-y"), ("x", "-z", "y"), ("y", "z", "x"), ("z", "x", "y")):
-        words = "have positions and rotations in different frames, for example one with z up and the other with y up"
-        exchanged = replace(stream, position=in_axes(stream.position, axes))
-        yield Convention(exchanged, f"{words}; set its position_axes to [{', '.join(axes)}]")
+        words = f"{_TWO_FRAMES}; set its position_axes to [{', '.join(axes)}]"
+        yield Convention(_with_axes(stream, axes), words)
 
 
 def with_checked_convention(
@@ -213,7 +213,7 @@ def _in_two_frames(stream: PoseStream, rotation_of: Callable[[PoseStream], np.nd
     degrees = ", ".join(f"{angle:.0f}" for angle in Rotation.from_matrix(C).as_euler("xyz", degrees=True))
     yield Convention(
         replace(stream, position=stream.position @ C.T),
-        "have positions and rotations in different frames, for example one with z up and the other with y up; "
+        f"{_TWO_FRAMES}; "
         + (
             f"set its position_axes to {axes}"
             if axes
