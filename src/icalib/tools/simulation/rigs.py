@@ -10,9 +10,8 @@ import numpy as np
 import yaml
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
+from icalib.rig import BY_CLASS, TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
 from icalib.rig.file import rig_to_dict
-from icalib.sensors.imu.spec import BY_CLASS
 from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
 from icalib.tools.simulation.sensors.imu import rotation_from_vector
