@@ -23,7 +23,6 @@ NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
     "detection/primitives/corners.py",  # the stream of the corners of images, for users
-    "estimate/noise_size.py",  # noise densities of the IMU
     "initialize/assumed_sensors.py",  # they are an IMU and a pose sensor
     "motion/imu_data.py",  # readings of the IMU, which link keyframes
     "result/calibration.py",  # shorthand, for users

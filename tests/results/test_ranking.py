@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.estimate.noise_size import are_noise
 from icalib.observability.cause import Cause
 from icalib.result import SensorFit
 from icalib.sensors.camera.assess.exposure_lag import image_velocity
 from icalib.validation.causes import Misfit, explaining, ranked
+from icalib.validation.misfit import are_noise
 
 
 def fits(*ratios: float) -> list[SensorFit]:

@@ -72,12 +72,9 @@ class SensorModel(Generic[S, N]):
     with a pose and a clock but no factor.
 
     keyframes: measurements at which keyframes are placed, as in "images of cam0"; empty if the kind places none.
-    refitted: kind of residuals whose noise is fitted again when another noise density of the IMU is tried; empty if
-    there is none.
     """
 
     keyframes: ClassVar[str] = ""
-    refitted: ClassVar[str] = ""
 
     # Measurements
 
@@ -156,10 +153,6 @@ class SensorModel(Generic[S, N]):
     def noise_is_estimated(self, sensor: S) -> bool:
         """Whether some of the noise is estimated from residuals."""
         return self.noise_passes(sensor) > 0
-
-    def scaled_noise(self, noise: N, scale: float) -> N:
-        """The noise with standard deviations multiplied by `scale`; only for kinds with `refitted` residuals."""
-        raise NotImplementedError
 
     # Noise and inliers of all sensors of the kind; overridden by kinds whose sensors share measurements
 

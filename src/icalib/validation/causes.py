@@ -2,18 +2,17 @@
 
 A cause is tested by its gain: the decrease of chi^2 if the cause is modelled. A significant cause that explains hardly
 any of the misfit is not named. If no cause explains the misfit, the message says so and lists the checks. Another noise
-density is advised only if `fitting_noise` shows that it explains the misfit.
+density of the IMU is advised only if its readings show it by themselves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.noise_size import NoiseFit
 from icalib.estimate.problem.inputs import Inputs
 from icalib.estimate.residual_statistics.parameter_changes import Change, changes, scatter
 from icalib.estimate.residual_statistics.segments import Segments
@@ -21,6 +20,7 @@ from icalib.observability.cause import Cause
 from icalib.result import SensorFit
 from icalib.result.excess import FAR_BEYOND, excess, times
 from icalib.result.timeline import Timeline
+from icalib.rig import ImuSensor, Rig
 from icalib.sensors import call_all_kinds
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.validation.disturbance import Disturbance, disturbance
@@ -34,6 +34,12 @@ EXPLAINS = 0.1
 CHANGES = 0.25
 ALIKE = 0.8  # share of the best gain from which on another change explains the data as well
 LARGE = 2.0  # tolerances; a constant value is wrong by half of a change
+_MOUNT = "Fasten all mounts."
+_AGAINST = {
+    "intrinsics": "Switch off autofocus, zoom and image stabilisation.",
+    "rotation": _MOUNT,
+    "translation": _MOUNT,
+}
 INERTIAL = ("gyroscope", "accelerometer")
 
 
@@ -116,32 +122,37 @@ def _is_large(c: Change, segments: Segments) -> bool:
     return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
 
 
-def noise_words(inputs: Inputs, noise: NoiseFit) -> str:
-    """A sentence that the stated noise is too small or too large, with the noise that fits."""
-    assert inputs.rig.imu is not None
-    size = "small" if max(noise.scales.values()) > 1.0 else "large"
-    n, scales = noise.noise, ", ".join(f"{kind} {scale:.2g}x" for kind, scale in noise.scales.items())
-    fields = f"gyro: {n.gyro:.2g}, gyro_walk: {n.gyro_walk:.2g}, accel: {n.accel:.2g}, accel_walk: {n.accel_walk:.2g}"
+def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> str:
+    """A sentence that the stated noise is too small, as readings show, or too large, as residuals show. scales: fitting
+    over stated density by kind of INERTIAL. Bias random walks are not shown: they become larger, too, never smaller."""
+    is_small, n = max(scales.values()) > 1.0, imu.noise
+    gyro, accel = (scales[kind] for kind in INERTIAL)
+    fields = (
+        f"gyro: {gyro * n.gyro:.2g}, gyro_walk: {max(gyro, 1.0) * n.gyro_walk:.2g}, accel: {accel * n.accel:.2g}, "
+        f"accel_walk: {max(accel, 1.0) * n.accel_walk:.2g}"
+    )
     return (
-        f"the stated noise of {inputs.rig.imu.name} is too {size}: the noise that its residuals show is, over the "
-        f"stated one, {scales}. With that they are white, and constant over the recording. Write noise: {{{fields}}} "
+        f"the stated noise of {imu.name} is too {'small' if is_small else 'large'}: "
+        f"over the stated one, {'readings in quiet moments show at least' if is_small else 'residuals show at most'} "
+        f"{', '.join(f'{kind} {scale:.2g}x' for kind, scale in scales.items())}. Write noise: {{{fields}}} "
         "and calibrate again."
     )
 
 
-def unknown_words(misfit: Misfit, noise: NoiseFit | None) -> str:
+def unknown_words(rig: Rig, misfit: Misfit) -> str:
     """A sentence that the cause is unknown, with the checks that were made."""
-    pattern = ""
-    if noise is not None and not noise.is_white:
-        pattern = ", and are no white noise"
-    elif noise is not None and not noise.is_constant:
-        pattern = ", and vary over the recording"
+    checks = {
+        "noise of the readings, fixed values and priors": True,
+        "target size": rig.has_target,
+        "camera models and lenses that change": bool(rig.cameras),
+        "swapped cameras": len(rig.cameras) > 1,
+        "clocks that drift or jump, mounts that move, disturbances at one time": True,
+    }
     return (
-        f"residuals are larger than the stated noise predicts ({misfit.words}){pattern}; the cause is unknown. "
-        "Checked: fixed values and priors, target size, swapped cameras, camera models, clocks that drift or jump, "
-        "mounts and lenses that change, disturbances at one time. Do not enlarge the noise: errors would stay larger "
-        "than the standard deviations. Record again, with slower motion and firm mounts, and compare both results by "
-        "icalib compare."
+        f"residuals are larger than the stated noise predicts ({misfit.words}); the cause is unknown. "
+        f"Checked: {', '.join(check for check, made in checks.items() if made)}. Do not state more noise than "
+        "readings show: errors would stay larger than the standard deviations. Record again, with slower motion and "
+        "firm mounts, and compare both results by icalib compare."
     )
 
 
@@ -165,11 +176,11 @@ def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -
     if best.name == TIME_OFFSET.name:
         return _clock_words(best, others, segments, when, timeline)
     what = " or ".join(_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name)
-    lens = any(c.name == "intrinsics" for c in alike)
-    off = " Switch off autofocus, zoom and image stabilisation." if lens else ""
+    against = (_AGAINST.get(c.name, "Check tyres, load and encoders.") for c in alike if c.name != TIME_OFFSET.name)
+    advice = " ".join(dict.fromkeys(against))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
     return (
-        f"{_names(best)} changes {when}: {what}{instead}.{off} Fasten all mounts and record again"
+        f"{_names(best)} changes {when}: {what}{instead}. {advice} Record again"
         f"{_apart(best, timeline, ', or calibrate the recording before or after that alone')}."
     )
 
@@ -182,6 +193,9 @@ def _changed(c: Change, segments: Segments) -> str:
     """Text with the size of a change of a lens or of extrinsics."""
     if c.name == "intrinsics":
         return f"its lens by up to {np.abs(c.value).max():.2g} px"
+    if c.name not in ("rotation", "translation"):
+        value = segments.state.values[c.sensors[0], c.name]
+        return f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
     turn, move = _sizes(segments, c)
     return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
 

@@ -35,7 +35,7 @@ from icalib.sensors.camera.corner_noise import (
     with_jitter,
 )
 from icalib.sensors.camera.corner_outliers import inliers
-from icalib.sensors.camera.corner_statistics import CORNERS, DELAY, SHIFT
+from icalib.sensors.camera.corner_statistics import DELAY, SHIFT
 from icalib.sensors.camera.edge_curvature import with_bent_edges
 from icalib.sensors.camera.features.error_clusters import error_clusters
 from icalib.sensors.camera.features.patch_curvature import with_curved_patches
@@ -74,7 +74,6 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     """Sensor model of cameras. Without an IMU, images with equal stamps are simultaneous."""
 
     keyframes = "images"
-    refitted = CORNERS
 
     def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies:
         """See `SensorModel`, and `choose_bodies`."""
@@ -103,11 +102,6 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         columns = layout.columns(sensor.name, *LENS)
         if (columns >= 0).all():
             sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(sensor, state, sigma[columns[4:]]))
-
-    def scaled_noise(self, noise: CameraNoise, scale: float) -> CameraNoise:
-        """See `SensorModel`: scales sigma of the corners."""
-        sigma = noise.corners.sigma
-        return replace(noise, corners=replace(noise.corners, sigma=(scale * sigma).astype(sigma.dtype)))
 
     def first_noises(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> dict[str, CameraNoise]:
         """For each camera the noise of the rig file or a default, with all corners and track observations in use."""

@@ -141,7 +141,10 @@ def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
     what, field, unit = _ROWS.get("" if relative else f.kind, (f.kind, "", ""))
     words = f"{what} residuals of {wheels.name} are {times(f)} larger than {field or 'its noise'} predicts"
     if not is_noise:
-        return f"{words}, and are no white noise, as where wheels skid; take such parts out, or drive slower."
+        return (
+            f"{words}, and are no white noise; the cause is unknown. Wheels that skid, stop counting or lose air have "
+            "such residuals. Take out parts where they are large."
+        )
     if not field:
         return f"{words}; use factor: increments."
     return f"{words}; write {field}: {excess(f) * getattr(wheels, field):.2g} ({unit}) and calibrate again."

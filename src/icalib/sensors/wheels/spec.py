@@ -194,6 +194,11 @@ class Wheels(MountedSensor):
         return DRIVES[self.kind]
 
     @property
+    def may_change(self) -> tuple[tuple[str, ...], ...]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """See `Sensor`: also the size of wheels, as that of tyres with their load and air."""
+        return (*MountedSensor.may_change, (self.drive_specs[0].name,))
+
+    @property
     def knows_height(self) -> bool:
         """Whether `ground_height` is estimated."""
         return self.ground is not None and self.ground.height_sigma is not None

@@ -6,6 +6,8 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+
 from icalib.sensors.imu.inspect.facts import ImuSource
 from icalib.sensors.imu.read.table_kinds import CARRIED
 from icalib.sensors.imu.spec import DEFAULT_CLASS, IMU_CLASSES, ImuNoise, TwoSources, class_noise, class_of_noise
@@ -25,6 +27,9 @@ def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[st
     yield "    " + place_line(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
     kalibr = _kalibr_imu(inspection, topic.name)
     yield from _noise(kalibr)
+    if facts and np.isfinite(facts.scatter).all():
+        gyro, accel = facts.scatter
+        yield f"    # Its readings in quiet moments show at least gyro: {gyro:.2g}, accel: {accel:.2g}."
     yield "    # The most valuable line of this draft: how far axes and scales of this IMU may be off. Rotations and"
     yield f"    # lengths depend on it. One of {', '.join(IMU_CLASSES)}; `fixed` if it is calibrated."
     noise = class_noise(DEFAULT_CLASS) if kalibr is None else ImuNoise(**kalibr.densities, source="")

@@ -16,8 +16,8 @@ class ImuFacts:
 
     frame: frame id. mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean.
     principal_rms: RMS rate about the directions `principal` (unit vectors), largest first. gravity_spread: result of
-    `gravity_turns.gravity_spread` for rates taken as rad/s, as deg/s, and as zero. problem: why `calibrate` would
-    refuse the readings, else "".
+    `gravity_turns.gravity_spread` for rates taken as rad/s, as deg/s, and as zero. scatter: `quiet_scatter` of
+    gyro and accel. problem: why `calibrate` would refuse the readings, else "".
     """
 
     frame: str
@@ -31,6 +31,7 @@ class ImuFacts:
     principal_rms: Vector
     principal: tuple[Vector, Vector, Vector]
     gravity_spread: Vector | None
+    scatter: tuple[float, float]
     saturated: tuple[Saturation, ...]
     notes: tuple[str, ...]
     problem: str = ""

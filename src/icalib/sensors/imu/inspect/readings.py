@@ -14,6 +14,7 @@ from icalib.sensors.imu.read import readings
 from icalib.sensors.imu.read.checks import checked_imu, saturations
 from icalib.sensors.imu.read.gravity_turns import gravity_spread
 from icalib.sensors.imu.read.halves import one_stream
+from icalib.sensors.imu.scatter import quiet_scatter
 from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
 from icalib.tools.inspection.facts import Vector
 
@@ -55,6 +56,9 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         principal_rms=_vector(np.sqrt(np.maximum(squares[::-1], 0.0))),
         principal=(first, second, third),
         gravity_spread=None if problem else _spreads(imu),
+        scatter=(np.nan, np.nan)
+        if problem
+        else (quiet_scatter(imu.seconds, imu.gyro), quiet_scatter(imu.seconds, imu.accel)),
         saturated=saturations(imu) if finite.all() and len(imu.gyro) else (),
         notes=notes,
         problem=problem,
