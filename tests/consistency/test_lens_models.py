@@ -44,7 +44,7 @@ def stills(
 
 
 def pattern_of(result: Calibration) -> list[str]:
-    return [w for w in result.warnings if "alike wherever in the image" in w]
+    return [w for w in result.warnings if "alike at the same place in all images" in w]
 
 
 def test_where_the_model_does_not_follow_the_lens_another_is_named():
@@ -96,16 +96,16 @@ def test_models_are_compared_by_the_corners_of_the_detector(monkeypatch):
     given = []
     monkeypatch.setattr(lens_models, "compare_models", lambda *args: given.append(args) or (None, None))
     result = calibrate_measurements(rig, measurements)
-    ((factor, out, state, settings),) = given
+    ((factor, out, state, settings, noise),) = given
     np.testing.assert_array_equal(factor.stream.uv, stream.uv)
     monkeypatch.undo()
-    all_own, all_best = lens_models.compare_models(factor, out, state, settings)
+    all_own, all_best = lens_models.compare_models(factor, out, state, settings, noise)
     assert all_own is not None and all_best is not None
     (residuals,) = result.corner_residuals
     size = np.linalg.norm(residuals.residual, axis=1)
     large = size > np.quantile(size, 0.8)  # as if the own model had rejected what it cannot follow
     root = np.where(large, 0.0, out.root)
-    own, best = lens_models.compare_models(factor, dataclasses.replace(out, root=root), state, settings)
+    own, best = lens_models.compare_models(factor, dataclasses.replace(out, root=root), state, settings, noise)
     for fewer, whole in ((own, all_own), (best, all_best)):
         assert fewer is not None
         assert fewer.model is whole.model
