@@ -87,6 +87,18 @@ def test_outliers_beside_an_error_of_the_lens_are_rejected_and_the_rest_is_not()
     assert "write `model: eucm`" in pattern_of(result)[0]
 
 
+def test_where_no_model_follows_none_is_named_but_the_region_is():
+    """A drop of water on the glass, of 60 px, moves corners by up to 8 px."""
+    rig, measurements, _ = stills(NARROW, "pinhole-radtan", 1)
+    (stream,) = measurements.cameras
+    near = np.exp(-((stream.uv - [560.0, 150.0]) ** 2).sum(axis=1) / (2.0 * 60.0**2))
+    uv = stream.uv + near[:, None] * [6.0, 3.0]
+    result = calibrate_measurements(rig, Measurements.of_streams(dataclasses.replace(stream, uv=uv)))
+    (words,) = pattern_of(result)
+    assert "top right corner" in words and "no other camera model follows them clearly better" in words
+    assert "write `model" not in words
+
+
 def test_models_are_compared_by_the_corners_of_the_detector(monkeypatch):
     """Neither the correction of bent edges by the own lens nor the corners that it rejects favour the own model."""
     rig, measurements, wrong = stills(WIDE, "pinhole-radtan", 4, outliers=0.01, images=24)

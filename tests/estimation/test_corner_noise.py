@@ -15,10 +15,8 @@ from icalib.model.statistics import Fit
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.assess import lens_models
 from icalib.sensors.camera.corner_factor import CornerNoise
-from icalib.sensors.camera.corner_misfit import LensMisfit
 from icalib.sensors.camera.corner_noise import (
     NoiseModel,
-    ResidualNoise,
     estimate_noise,
     from_middle,
     image_flow,
@@ -111,24 +109,24 @@ def test_images_that_see_the_misfit_are_in_both_halves(unlike, setup_of, factor_
     ],
 )
 def test_the_region_of_the_misfit_is_named(places, words):
-    uv = np.array([*places, (376, 10), (800, 500)], float)  # the last one is outside the image
-    field = np.ones((len(uv), 2)) * np.array([4.0, 3.9, 2.0, 0.1, 0.1])[-len(uv) :, None]
+    """By the mean: of the top edge there are many corners, each with a small misfit."""
+    uv = np.array([*places, (800, 500), *[(376, 10)] * 1000], float)  # the second kind is outside the image
+    field = np.full((len(uv), 2), 1.0)
     field[: len(places)] = np.linspace(4.0, 3.0, len(places))[:, None]
     assert lens_models.worst_regions(uv, field, (752, 480)) == words
 
 
 @pytest.mark.parametrize(("left", "fewer", "beaten"), [(0.266, 20, True), (0.266, 14, False), (0.26, 20, False)])
 def test_models_are_compared_by_the_misfit_and_not_by_the_ratio_of_rms(monkeypatch, left, fewer, beaten):
-    """Half the noise is 0.084 px. The worse model has 0.091 px more of misfit than the other, or 0.071 px."""
+    """The worse model has 0.091 px more of misfit than the other, or 0.071 px."""
     error = {"of": {}}
     monkeypatch.setattr(lens_models._Trial, "rms", property(lambda trial: error["of"][id(trial)][0]))
     monkeypatch.setattr(lens_models._Trial, "squared_error", property(lambda trial: error["of"][id(trial)][1]))
     no_fit: Any = None
     old, new = (lens_models._Trial(camera_model(name), no_fit, no_fit) for name in ("pinhole-radtan", "eucm"))
     error["of"] = {id(old): (left, np.ones(20)), id(new): (0.25, np.where(np.arange(20) < fewer, 0.9, 1.1))}
-    noise = ResidualNoise(0.168, 0.0, LensMisfit(0.2, np.zeros((0, 2))))
-    assert lens_models._beats(new, old, noise) == beaten
-    assert not lens_models._beats(old, new, noise)
+    assert lens_models._beats(new, old, 0.084**2) == beaten
+    assert not lens_models._beats(old, new, 0.084**2)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 2e-3])

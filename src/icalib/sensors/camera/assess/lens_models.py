@@ -37,6 +37,7 @@ from icalib.sensors.camera.spec import LENS, Camera
 MOST_IMAGES = 40  # images of a comparison, half of them for the test; the computing time is proportional
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
 FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
+EXPLAINED = 0.5  # least share of the misfit's variance that a model must remove to be named
 SIGN_TEST_SIGMAS = 3.0  # least deviation of the number of images that another model fits better from half of them
 NO_BETTER_MODEL = ", and no other camera model follows them clearly better"
 CHECK_IMAGES = "; check that the images are as the camera took them, and that the target is as the rig file says."
@@ -106,12 +107,13 @@ def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
 
 
 def worst_regions(uv: np.ndarray, field: np.ndarray, resolution: tuple[int, int]) -> str:
-    """Names of the fewest of nine image regions that hold half of the squared misfit. uv (N, 2) px: corners; field
-    (N, 2) px: their misfit; resolution: width and height [px]."""
+    """Names of the fewest of nine image regions whose mean squared misfits are half of the sum of all nine.
+    uv (N, 2) px: corners; field (N, 2) px: their misfit; resolution: width and height [px]."""
     column, row = np.clip(3.0 * uv / resolution, 0, 2).astype(int).T
-    share = np.bincount(3 * row + column, (field**2).sum(axis=1), 9)
-    order = np.argsort(-share)
-    count = int(np.searchsorted(share[order].cumsum(), 0.5 * share.sum())) + 1
+    region = 3 * row + column
+    square = np.bincount(region, (field**2).sum(axis=1), 9) / np.maximum(np.bincount(region, minlength=9), 1)
+    order = np.argsort(-square)
+    count = int(np.searchsorted(square[order].cumsum(), 0.5 * square.sum())) + 1
     return " and ".join(REGIONS[k // 3][k % 3] for k in order[:count])
 
 
@@ -132,7 +134,7 @@ def compare_models(
     corners, `noise` their noise and misfit.
 
     The first is None if there are too few images, or if the camera's model cannot be fitted to them. The second is None
-    if no model is clearly better (`_beats`).
+    if no model explains half of the misfit.
     """
     halves = _halves(with_circle_centres(factor, state), out, state, noise.lens.field)
     if halves is None:
@@ -154,20 +156,20 @@ def compare_models(
     current = next((fit for fit in second if fit.model is factor.model), None)
     if current is None:
         return None, None
-    better = [fit for fit in second if _beats(fit, current, noise)]
+    better = [fit for fit in second if _beats(fit, current, EXPLAINED * noise.lens.rms**2)]
     least = min(better, key=lambda fit: fit.rms, default=current)
-    equal = [fit for fit in better if not _beats(least, fit, noise)]
+    equal = [fit for fit in better if not _beats(least, fit, (LARGE_MISFIT_RATIO * noise.base) ** 2)]
     return current, min(equal, key=lambda fit: len(fit.model.parameter_names), default=None)
 
 
-def _beats(fit: _Trial, other: _Trial, noise: ResidualNoise) -> bool:
-    """Whether `fit` leaves less of the misfit than `other`: what only `other` leaves is large beside the noise, and
-    `fit` is better in more images than chance explains (sign test)."""
+def _beats(fit: _Trial, other: _Trial, variance: float) -> bool:
+    """Whether `fit` leaves less misfit than `other`: by more than `variance` [px^2], and in more images than chance
+    explains (sign test)."""
     better, n = int((fit.squared_error < other.squared_error).sum()), len(fit.squared_error)
     # If both models are equally good, `better` has mean n / 2 and standard deviation sqrt(n) / 2. The variance alone
     # may depend on a few images.
     by_chance = better - 0.5 * n < 0.5 * SIGN_TEST_SIGMAS * np.sqrt(n)
-    return other.rms**2 - fit.rms**2 > (LARGE_MISFIT_RATIO * noise.base) ** 2 and not by_chance
+    return other.rms**2 - fit.rms**2 > variance and not by_chance
 
 
 def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints, tested: ImagePoints) -> _Trial | None:
