@@ -36,9 +36,9 @@ class Figure:
 
 
 FIGURES_OF_THE_PAGE = (
-    Figure("trust", "out", "trust"),
-    Figure("corners", "out", "images", "#images > :nth-child(n + 5), #time-0"),
-    Figure("corners-lens", "out-lens", "images", "#images > :nth-child(n + 5), #time-0"),
+    Figure("trust", "out-published", "trust"),
+    Figure("corners", "out-published", "images", "#images > :nth-child(n + 5), #time-0"),
+    Figure("corners-lens", "out", "images", "#images > :nth-child(n + 5), #time-0"),
     Figure("jump", "out-jump", "images", "#images > p, #plane-0, #image-0, #plane-1, #image-1"),
 )
 

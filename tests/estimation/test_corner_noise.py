@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
+from tests.typed import not_none
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.inputs import Inputs
+from icalib.geometry.cameras import camera_model
 from icalib.model.statistics import Fit
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.assess import lens_models
@@ -79,6 +81,52 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
     inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
     assert len(list(lens_models.wrong_models(cast(Inputs, inputs), cast(Estimate, found)))) == large
+
+
+def test_images_that_see_the_misfit_are_in_both_halves(unlike, setup_of, factor_of, monkeypatch):
+    """Two images see it, and both are even; of each part of the recording one image is taken."""
+    setup = setup_of(unlike)
+    factor = factor_of(setup, 0)
+    out = factor.output(np.float64)
+    out.root[:] = 1.0
+    images, seen = len(factor.stream.stamps_ns), np.isin(factor.stream.image, (2, 6))
+    field = np.where(seen[:, None], 3.0, 0.01) * np.ones(2)
+    for most in (40, 4):
+        monkeypatch.setattr(lens_models, "MOST_IMAGES", most)
+        rows, fitted, tested = not_none(lens_models._halves(factor, out, setup.state, field))
+        halves = np.split(rows, [len(fitted.uv)])
+        assert len(halves[1]) == len(tested.uv)
+        assert [np.unique(factor.stream.image[half[seen[half]]]).tolist() for half in halves] == [[2], [6]]
+        assert sum(len(np.unique(factor.stream.image[half])) for half in halves) == min(most, images)
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        ([(740, 10)], "top right corner"),
+        ([(376, 240)], "centre"),
+        ([(10, 240), (740, 240), (376, 479)], "left edge and right edge"),
+    ],
+)
+def test_the_region_of_the_misfit_is_named(places, words):
+    """By the mean: of the top edge there are many corners, each with a small misfit."""
+    uv = np.array([*places, (800, 500), *[(376, 10)] * 1000], float)  # the second kind is outside the image
+    field = np.full((len(uv), 2), 1.0)
+    field[: len(places)] = np.linspace(4.0, 3.0, len(places))[:, None]
+    assert lens_models.worst_regions(uv, field, (752, 480)) == words
+
+
+@pytest.mark.parametrize(("left", "fewer", "beaten"), [(0.266, 20, True), (0.266, 14, False), (0.26, 20, False)])
+def test_models_are_compared_by_the_misfit_and_not_by_the_ratio_of_rms(monkeypatch, left, fewer, beaten):
+    """The worse model has 0.091 px more of misfit than the other, or 0.071 px."""
+    error = {"of": {}}
+    monkeypatch.setattr(lens_models._Trial, "rms", property(lambda trial: error["of"][id(trial)][0]))
+    monkeypatch.setattr(lens_models._Trial, "squared_error", property(lambda trial: error["of"][id(trial)][1]))
+    no_fit: Any = None
+    old, new = (lens_models._Trial(camera_model(name), no_fit, no_fit) for name in ("pinhole-radtan", "eucm"))
+    error["of"] = {id(old): (left, np.ones(20)), id(new): (0.25, np.where(np.arange(20) < fewer, 0.9, 1.1))}
+    assert lens_models._beats(new, old, 0.084**2) == beaten
+    assert not lens_models._beats(old, new, 0.084**2)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 2e-3])

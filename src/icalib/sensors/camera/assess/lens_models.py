@@ -1,13 +1,13 @@
 """Warns if the camera model of the rig file does not follow the lens, and names a model that does.
 
 Models are compared by cross-validation. Each model is fitted to half of the images, with poses and board shape free,
-and tested on the images between, in which only poses are fitted. All models use the same detected corners: a corner is
-rejected only if no model explains it.
+and tested on the other half, in which only poses are fitted. Both halves see the places of the image where the misfit
+is. All models use the same detected corners: a corner is rejected only if no model explains it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -24,20 +24,28 @@ from icalib.optim.state import State
 from icalib.rig import Settings
 from icalib.sensors.camera.circle_centres import with_circle_centres
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
-from icalib.sensors.camera.corner_noise import image_flow, image_speed, residual_noise
+from icalib.sensors.camera.corner_noise import (
+    LARGE_MISFIT_RATIO,
+    ResidualNoise,
+    image_flow,
+    image_speed,
+    residual_noise,
+)
 from icalib.sensors.camera.corner_outliers import rejected
 from icalib.sensors.camera.spec import LENS, Camera
 
 MOST_IMAGES = 40  # images of a comparison, half of them for the test; the computing time is proportional
 FEWEST_IMAGES = 4  # in each half; with fewer no model is fitted
 FEWEST_CORNERS = 8  # in an image; its pose takes up six of their 16 coordinates
-BETTER = 0.9  # ratio of the RMS of another model to that of the camera's model, above which the other is not named
-EQUAL = 1.1  # times the least RMS: among the models below it, that with fewest parameters is named
+EXPLAINED = 0.5  # least share of the misfit's variance that a model must remove to be named
 SIGN_TEST_SIGMAS = 3.0  # least deviation of the number of images that another model fits better from half of them
-NO_BETTER_MODEL = (
-    ", and no other camera model follows them clearly better; check that the images are as the camera took them, and "
-    "that the target is as the rig file says."
-)
+NO_BETTER_MODEL = ", and no other camera model follows them clearly better"
+CHECK_IMAGES = "; check that the images are as the camera took them, and that the target is as the rig file says."
+REGIONS = (
+    ("top left corner", "top edge", "top right corner"),
+    ("left edge", "centre", "right edge"),
+    ("bottom left corner", "bottom edge", "bottom right corner"),
+)  # thirds of the image, row by row
 
 
 @dataclass(frozen=True)
@@ -86,15 +94,27 @@ def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
         if not noise.lens_misfit_is_large:
             continue
         gain = 2.0 * float(np.count_nonzero(out.root)) * (noise.lens.rms / noise.base) ** 2
-        current, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings)
+        current, best = compare_models(replace(factor, stream=stream), out, state, inputs.rig.settings, noise)
         largest = float(np.linalg.norm(noise.lens.field, axis=1).max())
         misfit = (
-            f"the corners of {camera.name} are off by up to {largest:.2g} px, alike wherever in the image they are seen"
+            f"the corners of {camera.name} are off by up to {largest:.2g} px, alike at the same place in all images, "
+            f"most at the {worst_regions(stream.uv, noise.lens.field, camera.resolution)}"
         )
         if best is not None and current is not None:
             yield Cause(_named_model(misfit, current, best, camera), gain)
         elif noise.lens.rms > noise.base:
-            yield Cause(f"{misfit}{NO_BETTER_MODEL}", gain)
+            yield Cause(f"{misfit}{NO_BETTER_MODEL if current is not None else ''}{CHECK_IMAGES}", gain)
+
+
+def worst_regions(uv: np.ndarray, field: np.ndarray, resolution: tuple[int, int]) -> str:
+    """Names of the fewest of nine image regions whose mean squared misfits are half of the sum of all nine.
+    uv (N, 2) px: corners; field (N, 2) px: their misfit; resolution: width and height [px]."""
+    column, row = np.clip(3.0 * uv / resolution, 0, 2).astype(int).T
+    region = 3 * row + column
+    square = np.bincount(region, (field**2).sum(axis=1), 9) / np.maximum(np.bincount(region, minlength=9), 1)
+    order = np.argsort(-square)
+    count = int(np.searchsorted(square[order].cumsum(), 0.5 * square.sum())) + 1
+    return " and ".join(REGIONS[k // 3][k % 3] for k in order[:count])
 
 
 def _named_model(misfit: str, current: _Trial, best: _Trial, camera: Camera) -> str:
@@ -108,15 +128,15 @@ def _named_model(misfit: str, current: _Trial, best: _Trial, camera: Camera) -> 
 
 
 def compare_models(
-    factor: CornerFactor, out: CornerOutput, state: State, settings: Settings
+    factor: CornerFactor, out: CornerOutput, state: State, settings: Settings, noise: ResidualNoise
 ) -> tuple[_Trial | None, _Trial | None]:
     """The camera's model, and the model with fewest parameters that is clearly better. `factor` has all detected
-    corners.
+    corners, `noise` their noise and misfit.
 
     The first is None if there are too few images, or if the camera's model cannot be fitted to them. The second is None
-    if no model is clearly better: by a tenth in RMS, and in more images than chance explains (sign test).
+    if no model explains half of the misfit.
     """
-    halves = _halves(with_circle_centres(factor, state), out, state)
+    halves = _halves(with_circle_centres(factor, state), out, state, noise.lens.field)
     if halves is None:
         return None, None
     rows, fitted, tested = halves
@@ -124,7 +144,7 @@ def compare_models(
     models = [factor.model, *(camera_model(name) for name in CAMERA_MODELS if name != factor.model.name)]
     starts = [params, *(initial_parameters(m, factor.model, params, fitted) for m in models[1:])]
     pairs = [(m, start) for m, start in zip(models, starts, strict=True) if start is not None]
-    first = _successful_trials(_cross_validated(model, start, fitted, tested) for model, start in pairs)
+    first = [fit for model, start in pairs if (fit := _cross_validated(model, start, fitted, tested)) is not None]
     if not first:
         return None, None
     # Corners that the camera's model rejects may fit another model, so outliers are those of the best model at each
@@ -132,28 +152,24 @@ def compare_models(
     residuals = np.array([fit.residuals for fit in first])
     nearest = np.argmin((residuals**2).sum(axis=2), axis=0)
     used = ~rejected(factor, rows, residuals[nearest, np.arange(len(rows))], settings)
-    second = _successful_trials(_again(fit, used) for fit in first)
+    second = [again for fit in first if (again := _again(fit, used)) is not None]
     current = next((fit for fit in second if fit.model is factor.model), None)
-    return current, None if current is None else _clearly_better(current, [fit for fit in second if fit is not current])
+    if current is None:
+        return None, None
+    better = [fit for fit in second if _beats(fit, current, EXPLAINED * noise.lens.rms**2)]
+    least = min(better, key=lambda fit: fit.rms, default=current)
+    equal = [fit for fit in better if not _beats(least, fit, (LARGE_MISFIT_RATIO * noise.base) ** 2)]
+    return current, min(equal, key=lambda fit: len(fit.model.parameter_names), default=None)
 
 
-def _successful_trials(fits: Iterable[_Trial | None]) -> list[_Trial]:
-    """The trials that succeeded."""
-    return [fit for fit in fits if fit is not None]
-
-
-def _clearly_better(current: _Trial, others: list[_Trial]) -> _Trial | None:
-    """The model with fewest parameters among the `others` whose RMS is at most EQUAL times the least. None unless it is
-    clearly better than `current`."""
-    if not others:
-        return None
-    least = min(o.rms for o in others)
-    best = min((o for o in others if o.rms <= EQUAL * least), key=lambda o: len(o.model.parameter_names))
-    better, n = int((best.squared_error < current.squared_error).sum()), len(current.squared_error)
-    # Sign test: if both models are equally good, `better` has mean n / 2 and standard deviation sqrt(n) / 2. RMS alone
+def _beats(fit: _Trial, other: _Trial, variance: float) -> bool:
+    """Whether `fit` leaves less misfit than `other`: by more than `variance` [px^2], and in more images than chance
+    explains (sign test)."""
+    better, n = int((fit.squared_error < other.squared_error).sum()), len(fit.squared_error)
+    # If both models are equally good, `better` has mean n / 2 and standard deviation sqrt(n) / 2. The variance alone
     # may depend on a few images.
     by_chance = better - 0.5 * n < 0.5 * SIGN_TEST_SIGMAS * np.sqrt(n)
-    return best if best.rms < BETTER * current.rms and not by_chance else None
+    return other.rms**2 - fit.rms**2 > variance and not by_chance
 
 
 def _cross_validated(model: CameraModel, params: np.ndarray, fitted: ImagePoints, tested: ImagePoints) -> _Trial | None:
@@ -174,9 +190,12 @@ def _again(fit: _Trial, used: np.ndarray) -> _Trial | None:
 
 
 def _halves(
-    factor: CornerFactor, out: CornerOutput, state: State
+    factor: CornerFactor, out: CornerOutput, state: State, field: np.ndarray
 ) -> tuple[np.ndarray, ImagePoints, ImagePoints] | None:
-    """At most `MOST_IMAGES` images, spread over the recording: every other one for the fit, the rest for the test.
+    """At most `MOST_IMAGES` images, spread over the recording: half of them for the fit, the rest for the test.
+
+    The recording is cut into as many parts, and the image of each part is taken whose corners lie where the misfit
+    `field` (N, 2) px is largest. The halves take turns in the order of this misfit, so that both have it.
 
     Returns the rows (N,) int of their corners in the stream, and the points of both halves. These contain all corners;
     the corners that the estimate uses are marked as used. Points are in the camera frame, by the poses of `state`; uv
@@ -186,7 +205,10 @@ def _halves(
     rich = np.flatnonzero(np.bincount(stream.image[used], minlength=len(stream.stamps_ns)) >= FEWEST_CORNERS)
     if len(rich) < 2 * FEWEST_IMAGES:
         return None
-    chosen = rich[np.unique(np.linspace(0, len(rich) - 1, MOST_IMAGES).astype(int))]
+    misfit = np.bincount(stream.image, (field**2).sum(axis=1), len(stream.stamps_ns))
+    parts = np.array_split(rich, min(MOST_IMAGES, len(rich)))
+    chosen = np.array([part[np.argmax(misfit[part])] for part in parts])
+    chosen = chosen[np.argsort(-misfit[chosen], kind="stable")]
     row, points, R_cam_body = _in_camera(factor, state, chosen)
     rows, halves = [], []
     for images in (chosen[::2], chosen[1::2]):
