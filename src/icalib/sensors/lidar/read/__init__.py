@@ -31,6 +31,12 @@ UNREAD = (
         "that it sends",
     ),
     UnreadType(
+        r"sensor_msgs/msg/(MultiEcho)?LaserScan",
+        "points",
+        "scans of one plane, and icalib needs a 3D LiDAR's sensor_msgs/PointCloud2; run scan matching, and give its "
+        "nav_msgs/Odometry as a sensor of type: pose, kind: relative",
+    ),
+    UnreadType(
         r"\.(pcd|ply|las|laz) files",
         "points",
         "clouds that have no stamps; record the driver's sensor_msgs/PointCloud2 in a bag, or write scans.npz "

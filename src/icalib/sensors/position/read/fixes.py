@@ -52,15 +52,12 @@ def _metric(m: Any) -> RecordedFix:
 _STATUS = {0: SINGLE, 1: DIFFERENTIAL, 2: FIXED, 18: DIFFERENTIAL, 19: FIXED, 20: FLOAT, 33: DIFFERENTIAL}
 
 
-def _satellites(m: Any, status: int, otherwise: np.ndarray = UNKNOWN) -> RecordedFix:
-    """The fix of NavSatFix or GPSFix. otherwise: covariance if its type is unknown."""
-    covariance = m.position_covariance.reshape(3, 3) if m.position_covariance_type else otherwise
-    return RecordedFix((m.latitude, m.longitude, m.altitude), covariance, _STATUS.get(status, NO_FIX))
-
-
-def _gps_fix(m: Any) -> RecordedFix:
-    """Errors are bounds of 95 %, 1.96 standard deviations; 0 or NaN: unknown."""
-    return _satellites(m, m.status, np.diag((m.errors[[1, 1, 2]] / 1.96) ** 2))
+def _satellites(m: Any) -> RecordedFix:
+    """The fix of NavSatFix, or of GPSFix, whose errors are bounds of 95 %, 1.96 standard deviations; 0: unknown."""
+    bounds = getattr(m, "errors", np.zeros(3))[[1, 1, 2]]
+    covariance = m.position_covariance.reshape(3, 3) if m.position_covariance_type else np.diag((bounds / 1.96) ** 2)
+    status = _STATUS.get(getattr(m.status, "status", m.status), NO_FIX)
+    return RecordedFix((m.latitude, m.longitude, m.altitude), covariance, status)
 
 
 def _u_blox(m: Any, carrier: int, differential: bool, is_good: bool) -> RecordedFix:
@@ -155,11 +152,11 @@ _UBX_NAV_PVT = (
     f"uint8 num_sv, {_PLACE}, bool invalid, {_ENDING}"
 )
 _DECLARED: tuple[tuple[str, str, Callable[[Any], RecordedFix | None], str], ...] = (
-    ("sensor_msgs/msg/NavSatFix", NAVSAT, lambda m: _satellites(m, m.status.status), ""),
+    ("sensor_msgs/msg/NavSatFix", NAVSAT, _satellites, ""),
     ("geometry_msgs/msg/PointStamped", POINT, _metric, ""),
     *((f"geometry_msgs/msg/{n}Stamped", "pose", _metric, "") for n in ("Pose", "PoseWithCovariance", "Transform")),
     ("nav_msgs/msg/Odometry", "odometry", _metric, ""),
-    *((f"{package}/msg/GPSFix", RECEIVER, _gps_fix, _GPS_FIX) for package in ("gps_common", "gps_msgs")),
+    *((f"{package}/msg/GPSFix", RECEIVER, _satellites, _GPS_FIX) for package in ("gps_common", "gps_msgs")),
     ("ublox_msgs/msg/NavPVT", RECEIVER, _nav_pvt, _NAV_PVT),
     (
         "ublox_ubx_msgs/msg/UBXNavPVT",
