@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -84,3 +88,23 @@ def test_no_lines_where_it_is_quiet(capsys: pytest.CaptureFixture[str], monkeypa
         with progress_bar(quiet) as show:
             show("reading", 0.5)
         assert ("icalib: reading, 50% after" in capsys.readouterr().err) != quiet
+
+
+@pytest.mark.parametrize(
+    ("line", "completions"),
+    [
+        ("icalib comp", {"compare"}),
+        ("icalib calibrate rig.yaml run --lo", {"--loss"}),
+        ("icalib calibrate rig.yaml run --loss ", {"none", "huber", "cauchy"}),
+        ("icalib calibrate ri", {"rig.yaml"}),
+    ],
+)
+def test_a_shell_completes_commands_options_choices_and_paths(tmp_path: Path, line: str, completions: set[str]):
+    pytest.importorskip("argcomplete")
+    (tmp_path / "rig.yaml").touch()
+    answer = tmp_path / "answer"
+    asked = {"_ARGCOMPLETE": "1", "_ARGCOMPLETE_IFS": " ", "_ARGCOMPLETE_STDOUT_FILENAME": str(answer)}
+    asked |= {"_ARGCOMPLETE_SHELL": "bash", "COMP_LINE": line, "COMP_POINT": str(len(line)), "COMP_TYPE": "9"}
+    program = [sys.executable, "-c", "from icalib.cli import main; main()"]
+    subprocess.run(program, cwd=tmp_path, env=os.environ | asked, check=True, timeout=60)
+    assert {*answer.read_text().split()} == completions

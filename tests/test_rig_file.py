@@ -438,7 +438,7 @@ def test_two_imus_no_camera(tmp_path):
     lidar = "  lidar0: {type: lidar}\n"
     assert "sensors.lidar0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + lidar + rest)
     second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)
-    assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0" in second
+    assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0; keep one, and calibrate once for each" in second
 
 
 def test_without_an_imu_the_first_camera_is_the_body(tmp_path):

@@ -222,6 +222,7 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
         ),
         ("    min_range: 1", "    min_rnage: 1", "lidar0.min_rnage: there is no such field, did you mean 'min_range'"),
         ("drive: differential", "drive: tracks", "wheel0.drive: there is no such choice as 'tracks'"),
+        ("drive: differential", "drive: mecanum", "wheel0.drive: icalib has no model of mecanum and omni wheels; give"),
         ("drive: differential", "drive: ackermann", "radii: belongs to wheels with a left and a right side"),
         (
             "drive: differential",
@@ -263,7 +264,11 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
             "position_nose: 1",
             "mocap0.position_nose: there is no such field, did you mean 'pos",
         ),
-        ("  imu0: {type: imu}\n", "", "rig.yaml:3: sensors.lidar0: needs an IMU; add a sensor of type: imu"),
+        (
+            "  imu0: {type: imu}\n",
+            "",
+            "rig.yaml:3: sensors.lidar0: needs an IMU; add a sensor of type: imu, or run LiDAR odometry",
+        ),
     ],
 )
 def test_what_is_wrong_with_lidars_and_wheels_is_named(tmp_path, old, new, words):

@@ -7,21 +7,21 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.typed import instance
+from tests.typed import instance, not_none
 
 from icalib.data.recordings import open_recording
 from icalib.data.recordings.base import Reading
 from icalib.errors import RecordingError
 from icalib.rig import Rig, by_name
 from icalib.sensors.position.read import checked_positions, read
+from icalib.sensors.position.read.fixes import FIX_TYPES
 from icalib.sensors.position.read.readings import (
     AS_RECORDED,
     NO_COVARIANCE,
     PositionReadings,
     about_first,
+    from_fixes,
     from_geodetic,
-    from_navsat,
-    from_positions,
     good_fixes,
     left_out,
     read_position_table,
@@ -51,10 +51,10 @@ def pos_file(tmp_path, text, name="gnss.pos"):
 
 @pytest.mark.parametrize("scale", ["GPST", "UTC"])
 def test_a_solution_of_rtklib(tmp_path, scale):
-    read = read_pos(pos_file(tmp_path, HEADER.format(scale) + ROWS))
-    assert (read.scale, read.kind) == (scale, "geodetic")
+    read, coordinates = read_pos("gnss0", pos_file(tmp_path, HEADER.format(scale) + ROWS))
+    assert coordinates == "geodetic"
     assert read.stamps_ns.tolist() == [EPOCH_S * 10**9 + ns for ns in (749_000_000, 1_000_000_000, 1_250_000_000)]
-    np.testing.assert_array_equal(read.values[0], [40.0966916, -105.1471665, 1601.435])
+    np.testing.assert_array_equal(read.position[0], [40.0966916, -105.1471665, 1601.435])
     assert read.status.tolist() == [3, 2, 0]
     # East, north, up; off the diagonal signed squares of what the file has.
     expected = [[4e-4, 1.6e-5, -2.5e-5], [1.6e-5, 1e-4, 3.6e-5], [-2.5e-5, 3.6e-5, 9e-4]]
@@ -64,9 +64,9 @@ def test_a_solution_of_rtklib(tmp_path, scale):
 def test_week_and_seconds_and_angles_in_three_columns(tmp_path):
     header = "%  GPST          latitude(d'\") longitude(d'\") height(m)   Q  ns\n"
     rows = [f"2381 408639.749 40 05 48.0{k} -105 08 49.8 1601.4 1 25\n" for k in range(3)]
-    read = read_pos(pos_file(tmp_path, header + "".join(rows)))
+    read, _ = read_pos("gnss0", pos_file(tmp_path, header + "".join(rows)))
     assert read.stamps_ns[0] == EPOCH_S * 10**9 + 749_000_000
-    np.testing.assert_allclose(read.values[0], [40 + 5 / 60 + 48 / 3600, -(105 + 8 / 60 + 49.8 / 3600), 1601.4])
+    np.testing.assert_allclose(read.position[0], [40 + 5 / 60 + 48 / 3600, -(105 + 8 / 60 + 49.8 / 3600), 1601.4])
     assert not len(read.covariance)
 
 
@@ -80,7 +80,7 @@ def test_week_and_seconds_and_angles_in_three_columns(tmp_path):
 )
 def test_no_solution(tmp_path, text, sentence):
     with pytest.raises(RecordingError, match=sentence):
-        read_pos(pos_file(tmp_path, text))
+        read_pos("gnss0", pos_file(tmp_path, text))
 
 
 def readings(position, status=(), step_ns=200_000_000):
@@ -102,7 +102,7 @@ def test_metres_are_about_the_first_good_fix():
     status = np.array([-1, 0, 3, 3])
     read = readings(degrees, status)
     good = good_fixes(status, "float", 4)
-    metres, notes = from_geodetic("gnss.csv", read, degrees, good)
+    metres, notes = from_geodetic("gnss.csv", read, good)
     assert metres.stamps_ns.tolist() == [400_000_000, 600_000_000]
     np.testing.assert_array_equal(metres.position[0], 0.0)
     # 1e-5 degrees: 1.1104 m of a meridian at 40 degrees, 0.8543 m of the parallel.
@@ -127,16 +127,16 @@ def test_metres_are_about_the_first_good_fix():
 def test_what_is_wrong_with_latitude_and_longitude(degrees, sentence):
     degrees = np.array(degrees)
     with pytest.raises(RecordingError, match=sentence):
-        from_geodetic("gnss.csv", readings(degrees), degrees, np.ones(4, bool))
+        from_geodetic("gnss.csv", readings(degrees), np.ones(4, bool))
 
 
 def test_two_antennas_with_one_east_north_and_up():
     """Two routes to metres about the first fix of one antenna: directly, and about the first fix of the other."""
     degrees = np.array([[40.0, 8.0, 500.0], [40.01, 8.02, 530.0], [39.99, 8.0, 505.0], [40.02, 7.97, 480.0]])
     all_good = np.ones(4, bool)
-    expected, _ = from_geodetic("a", readings(degrees), degrees, all_good)
-    first, _ = from_geodetic("a", readings(degrees[:2]), degrees[:2], all_good[:2])
-    other, _ = from_geodetic("b", readings(degrees[2:]), degrees[2:], all_good[2:])
+    expected, _ = from_geodetic("a", readings(degrees), all_good)
+    first, _ = from_geodetic("a", readings(degrees[:2]), all_good[:2])
+    other, _ = from_geodetic("b", readings(degrees[2:]), all_good[2:])
     other = replace(other, covariance=np.tile(np.diag([1.0, 4.0, 9.0]), (2, 1, 1)))
     moved = other.inside("b", first.frame, "a")
     np.testing.assert_allclose(moved.position, expected.position[2:], atol=1e-6)
@@ -227,6 +227,11 @@ def test_what_is_no_motion_of_an_antenna(position, sentence):
         checked_positions(readings(position), "t.csv")
 
 
+def fixes(kind, messages):
+    _, fix_of = FIX_TYPES[kind]
+    return from_fixes("gnss0", [(5 + k, not_none(fix_of(message))) for k, message in enumerate(messages)])
+
+
 def navsat(status, kind=2, height=10.0):
     return SimpleNamespace(
         latitude=40.0,
@@ -239,29 +244,32 @@ def navsat(status, kind=2, height=10.0):
 
 
 def test_navsat_fixes_with_covariances():
-    read, degrees = from_navsat("gnss0", [(5, navsat(2)), (6, navsat(-1, 0, np.nan)), (7, navsat(0))])
+    read = fixes("sensor_msgs/msg/NavSatFix", [navsat(2), navsat(-1, 0, np.nan), navsat(0)])
     assert read.status.tolist() == [3, -1, 0]
-    np.testing.assert_array_equal(degrees[0], [40.0, 8.0, 10.0])
+    np.testing.assert_array_equal(read.position[0], [40.0, 8.0, 10.0])
     np.testing.assert_allclose(read.covariance[0], np.diag([1e-4, 2e-4, 4e-4]))
 
 
 def test_covariances_that_are_unknown_are_none():
-    read, _ = from_navsat("gnss0", [(5, navsat(2)), (7, navsat(0, 0))])
-    assert read.covariance.shape == (0, 3, 3)
+    assert fixes("sensor_msgs/msg/NavSatFix", [navsat(2), navsat(0, 0)]).covariance.shape == (0, 3, 3)
 
 
 def test_points_and_poses():
     point = SimpleNamespace(x=1.0, y=2.0, z=3.0)
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.diag([1e-4, 2e-4, 3e-4])
-    stamped = SimpleNamespace(point=point)
-    odometry = SimpleNamespace(
-        pose=SimpleNamespace(pose=SimpleNamespace(position=point), covariance=covariance.ravel())
-    )
-    for message, stated in ((stamped, 0), (SimpleNamespace(pose=SimpleNamespace(position=point)), 0), (odometry, 2)):
-        read = from_positions("prism0", [(1, message), (2, message)])
+    pose = SimpleNamespace(position=point)
+    stated = SimpleNamespace(pose=pose, covariance=covariance.ravel())
+    transform = SimpleNamespace(translation=point, rotation=None)
+    for kind, message, count in (
+        ("geometry_msgs/msg/PointStamped", SimpleNamespace(point=point), 0),
+        ("geometry_msgs/msg/PoseStamped", SimpleNamespace(pose=pose), 0),
+        ("geometry_msgs/msg/TransformStamped", SimpleNamespace(transform=transform), 0),
+        ("nav_msgs/msg/Odometry", SimpleNamespace(pose=stated), 2),
+    ):
+        read = fixes(kind, [message, message])
         np.testing.assert_array_equal(read.position, [[1.0, 2.0, 3.0]] * 2)
-        assert len(read.covariance) == stated
+        assert len(read.covariance) == count
 
 
 @pytest.mark.parametrize(
@@ -277,8 +285,8 @@ def test_tables(tmp_path, header, geodetic, stated):
     width = header.count(",") + 1
     rows = [[k * 200_000_000, 40.0 + k, 8.0, 5.0, 0.01, 0.02, 0.03][:width] for k in range(3)]
     path = pos_file(tmp_path, header + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows), "p.csv")
-    read, is_geodetic = read_position_table(PositionSensor("gnss0", "p.csv"), path)
-    assert is_geodetic == geodetic
+    read, coordinates = read_position_table(PositionSensor("gnss0", "p.csv"), path)
+    assert coordinates == ("geodetic" if geodetic else "local")
     np.testing.assert_array_equal(read.position[:, 0], [40.0, 41.0, 42.0])
     assert len(read.covariance) == stated
     if stated:
@@ -289,7 +297,7 @@ def test_columns_of_the_rig_file(tmp_path):
     """Named as in the header, whatever the names are."""
     path = pos_file(tmp_path, "a,b,c,d,lat_x\n" + "".join(f"{k}e-1,8,40,{k},5\n" for k in range(4)), "p.csv")
     sensor = PositionSensor("gnss0", "p.csv", layout=TableLayout(("a", "c", "b", "lat_x"), "s"))
-    read, is_geodetic = read_position_table(sensor, path)
-    assert not is_geodetic
-    assert read_position_table(replace(sensor, coordinates="geodetic"), path)[1]
+    read, coordinates = read_position_table(sensor, path)
+    assert coordinates == "local"
+    assert read_position_table(replace(sensor, coordinates="geodetic"), path)[1] == "geodetic"
     np.testing.assert_array_equal(read.position[2], [40.0, 8.0, 5.0])

@@ -21,6 +21,54 @@ ORIGIN = 1_404_733_405_732_800_001
 IMAGE_STEP, IMU_STEP, DELAY = 50_000_000, 5_000_000, 7_000_000  # DELAY: from the stamp to when it is received
 IMAGES, READINGS, SHAPE = 12, 120, (24, 32)
 
+GPS_STATUS = """std_msgs/Header header
+uint16 satellites_used
+int32[] satellite_used_prn
+uint16 satellites_visible
+int32[] satellite_visible_prn
+int32[] satellite_visible_z
+int32[] satellite_visible_azimuth
+int32[] satellite_visible_snr
+int16 status
+uint16 motion_source
+uint16 orientation_source
+uint16 position_source
+"""
+GPS_FIX = "std_msgs/Header header\nGPSStatus status\n" + "".join(
+    f"float64 {name}\n"
+    for name in (
+        "latitude", "longitude", "altitude", "track", "speed", "climb", "pitch", "roll", "dip", "time", "gdop", "pdop",
+        "hdop", "vdop", "tdop", "err", "err_horz", "err_vert", "err_track", "err_speed", "err_climb", "err_time",
+        "err_pitch", "err_roll", "err_dip",
+    )
+) + "float64[9] position_covariance\nuint8 position_covariance_type\n"  # fmt: skip
+PVT_CLOCK = "uint32 itow\nuint16 year\nuint8 month\nuint8 day\nuint8 hour\nuint8 min\nuint8 sec\n"
+PVT_PLACE = "".join(
+    f"{kind} {name}\n"
+    for kind, names in (
+        ("int32", ("lon", "lat", "height", "h_msl")), ("uint32", ("h_acc", "v_acc")),
+        ("int32", ("vel_n", "vel_e", "vel_d", "g_speed", "heading")), ("uint32", ("s_acc", "head_acc")),
+        ("uint16", ("p_dop",)),
+    )
+    for name in names
+)  # fmt: skip
+PVT_END = "int32 head_veh\nint16 mag_dec\nuint16 mag_acc\n"
+UBX = "ublox_ubx_msgs/msg"
+# Messages of receivers as their packages define them, with nested messages.
+RECEIVERS = {
+    **{f"{package}/msg/GPSStatus": GPS_STATUS for package in ("gps_common", "gps_msgs")},
+    **{f"{package}/msg/GPSFix": GPS_FIX for package in ("gps_common", "gps_msgs")},
+    "nmea_msgs/msg/Sentence": "std_msgs/Header header\nstring sentence\n",
+    "ublox_msgs/msg/NavPVT": f"{PVT_CLOCK}uint8 valid\nuint32 t_acc\nint32 nano\nuint8 fix_type\nuint8 flags\n"
+    f"uint8 flags2\nuint8 num_sv\n{PVT_PLACE}uint8[6] reserved1\n{PVT_END}",
+    f"{UBX}/GpsFix": "uint8 fix_type\n",
+    f"{UBX}/PSMPVT": "uint8 state\n",
+    f"{UBX}/CarrSoln": "uint8 status\n",
+    f"{UBX}/UBXNavPVT": f"std_msgs/Header header\n{PVT_CLOCK}bool valid_date\nbool valid_time\nbool fully_resolved\n"
+    "bool valid_mag\nuint32 t_acc\nint32 nano\nGpsFix gps_fix\nbool gnss_fix_ok\nbool diff_soln\nPSMPVT psm\n"
+    "bool head_veh_valid\nCarrSoln carr_soln\nbool confirmed_avail\nbool confirmed_date\nbool confirmed_time\n"
+    f"uint8 num_sv\n{PVT_PLACE}bool invalid_llh\n{PVT_END}",
+}
 Store = Literal["ros1", "ros2"]
 Message = tuple[str, str, int, Any]  # topic, type, when it was received [ns], content
 
@@ -37,6 +85,8 @@ class Maker:
         if self.kind == "ros1":  # of which rosbags has none
             for name in ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"):
                 store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", name))
+        for name, fields in RECEIVERS.items():
+            store.register(get_types_from_msg(fields, name))
         object.__setattr__(self, "store", store)
 
     def make(self, type_name: str, *values: Any) -> Any:

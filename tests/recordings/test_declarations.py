@@ -39,7 +39,7 @@ def declare(monkeypatch) -> Iterator[Callable[[str, object], None]]:
 
 def test_every_kind_declares_what_it_is_read_from():
     reads = [facet(kind, "read") for kind in SENSOR_KINDS]
-    assert all(callable(read.read) and callable(read.where) and read.MESSAGES and read.TABLES for read in reads)
+    assert all(callable(read.read) and callable(read.source) and read.MESSAGES and read.TABLES for read in reads)
 
 
 def test_kinds_that_share_a_type_of_messages_call_its_content_alike():

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tests.typed import random_rotations
 
-from icalib.data.messages import read_odometry, read_poses, read_twists
+from icalib.data.messages import read_poses, read_twists
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.sensors.camera.read.camera_info import read_camera_info
@@ -85,16 +85,17 @@ def odometry(make, k: int, header, body: str = "base"):
 
 
 def test_odometry(bag_of):
-    found = read_odometry(bag_of("nav_msgs/msg/Odometry", odometry), "/t")
-    check_poses(found.pose)
-    assert found.twist.frame == "base"
-    np.testing.assert_array_equal(found.twist.linear, LINEAR)
+    bag = bag_of("nav_msgs/msg/Odometry", odometry)
+    check_poses(read_poses(bag, "/t", "odometry"))
+    found = read_twists(bag, "/t", "odometry")
+    assert found.frame == "base"
+    np.testing.assert_array_equal(found.linear, LINEAR)
 
 
 def test_frame_that_changes(bag_of):
     bag = bag_of("nav_msgs/msg/Odometry", lambda make, k, header: odometry(make, k, header, f"base{k // 3}"))
     with pytest.raises(RecordingError, match="/t mixes the frames base0, base1"):
-        read_odometry(bag, "/t")
+        read_poses(bag, "/t", "odometry")
 
 
 def joints(make, k: int, header, speeds: int = 1):

@@ -84,6 +84,14 @@ def test_packets_of_a_lidar(tmp_path, kind):
     assert "raw packets" not in complaint(lambda: imu_readings(bag, IMU))
 
 
+@pytest.mark.parametrize("kind", ["sensor_msgs/msg/LaserScan", "sensor_msgs/msg/MultiEchoLaserScan"])
+def test_scans_of_one_plane(tmp_path, kind):
+    bag = open_recording(bag_of(tmp_path, "/scan", kind))
+    words = f"no points for lidar0: /scan ({kind}) holds scans of one plane, and icalib needs a 3D LiDAR's"
+    assert words in complaint(lambda: scans(bag, LIDAR))
+    assert "nav_msgs/Odometry as a sensor of type: pose, kind: relative." in complaint(lambda: scans(bag, LIDAR))
+
+
 @pytest.mark.parametrize("kind", VIDEOS)
 def test_compressed_video(tmp_path, kind):
     path = bag_of(tmp_path, "/cam/video", kind)
@@ -94,7 +102,7 @@ def test_compressed_video(tmp_path, kind):
     assert any("/cam/video holds compressed video" in f.sentence for f in inspect_recording(path).findings)
 
 
-@pytest.mark.parametrize("kind", ["sensor_msgs/msg/LaserScan", "diagnostic_msgs/msg/Packet", "nav_msgs/msg/Path"])
+@pytest.mark.parametrize("kind", ["sensor_msgs/msg/Range", "diagnostic_msgs/msg/Packet", "nav_msgs/msg/Path"])
 def test_other_types_are_none_of_these(kind):
     assert type_not_read(kind) is None
 

@@ -144,6 +144,29 @@ def test_twists_of_bags(bag_of, kind, content):
         wheel_readings(bag, Wheels("wheel0", ""))
 
 
+def sideways(make, k, t, shifted):
+    """Of mecanum wheels, or (shifted) of a differential drive, 0.4 m ahead of its axle and turned by 0.3 rad."""
+    v, w, lateral = *TWIST[k].tolist(), 0.4 * np.sin(0.9 * k)
+    along, across = (v, w * 0.4) if shifted else (v, lateral)
+    c, s = (np.cos(0.3), np.sin(0.3)) if shifted else (1.0, 0.0)
+    linear = make.make("geometry_msgs/msg/Vector3", c * along - s * across, s * along + c * across, 0.0)
+    twist = make.make("geometry_msgs/msg/Twist", linear, make.make("geometry_msgs/msg/Vector3", 0.0, 0.0, w))
+    return make.make("geometry_msgs/msg/TwistStamped", make.header(t), twist)
+
+
+@pytest.mark.parametrize("shifted", [False, True])
+def test_twists_of_mecanum_wheels(bag_of, shifted):
+    kind, wheels = "geometry_msgs/msg/TwistStamped", Wheels("wheel0", "", measures="twist")
+    bag = bag_of(kind, lambda make, k, t: sideways(make, k, t, shifted))
+    if shifted:
+        assert isinstance(wheel_readings(bag, wheels), WheelReadings)
+        return
+    with pytest.raises(
+        RecordingError, match="linear.y is .*% of its speed, and icalib has no model of mecanum .*: rel"
+    ):
+        wheel_readings(bag, wheels)
+
+
 def test_twists_in_the_axes_of_the_world(bag_of):
     """Of an odometry that circles to one side, then to the other."""
     rate = 0.4 * np.sign(np.sin(0.8 * (STAMPS - STAMPS[0]) * 1e-9))

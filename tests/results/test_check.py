@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -21,8 +22,9 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
+from icalib.result.as_rig import rig_of_result
 from icalib.rig.file import rig_to_dict
-from icalib.tools.check import Check, check_measurements
+from icalib.tools.check import Check, check_measurements, with_places
 from icalib.tools.check.check import joint_limit
 from icalib.tools.check.words import lines, verdict
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
@@ -176,6 +178,22 @@ def test_the_command(folders: Path, capsys: pytest.CaptureFixture[str]):
     assert {("cam0", "rotation"), ("cam1", "time_offset"), ("cam1", "distortion")} <= names
     assert {f["kind"] for f in plain["residuals"]["fixed"]} >= {"corners", "gyroscope"}
     assert main([*arguments, "--quiet", "--from", "1", "--to", "6"]) == 0 and capsys.readouterr().out == ""
+
+
+def test_other_paths_and_topics(folders: Path, known: Calibration, capsys: pytest.CaptureFixture[str]):
+    shutil.copytree(folders / "same", folders / "moved")
+    (folders / "moved" / "cam1").rename(folders / "moved" / "left")
+    arguments = ["check", str(folders / "out"), str(folders / "moved"), "--quiet"]
+    assert main(arguments) == 2
+    assert main([*arguments, "--path", "cam1=left/corners.csv"]) == 0
+    capsys.readouterr()
+    assert main([*arguments, "--topic", "cam9=/left"]) == 2
+    assert "the calibration has no sensor cam9; it has imu0, cam0, cam1." in capsys.readouterr().err
+    moved = rig_of_result(with_places(known, topic={"cam0": "/a"}, path={"cam1": "b.csv"}), "guess")[0]
+    assert [(c.topic, c.path) for c in moved.cameras] == [
+        ("/a", known.rig["sensors"]["cam0"].get("path", "cam0/corners.csv")),
+        (None, "b.csv"),
+    ]
 
 
 @pytest.mark.parametrize(

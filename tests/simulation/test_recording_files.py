@@ -145,6 +145,15 @@ def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch
     assert len(images) == len(measured.tracks[0].stamps_ns) and images[0].image.shape == (150, 200)
     assert images[0].image.std() > 10  # the board is in view; without it there is the noise of 2 grey levels
     assert (tmp_path / name / "truth.yaml").exists() == (name == "run")
+    rig = load_rig(tmp_path / ("run/rig.yaml" if name == "run" else "run.rig.yaml"))
+    assert set(rig.sensors) == {"imu0", *(s.name for s in measured.streams.values())}
+
+
+def test_the_rig_file_beside_a_bag_is_never_overwritten(simulation, tmp_path):
+    (tmp_path / "run.rig.yaml").write_text("mine")
+    with pytest.raises(RecordingError, match="run.rig.yaml exists already"):
+        write_sensors(simulation, 3, tmp_path / "run.bag")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
 def test_a_bag_without_a_target_shows_the_room(robot, tmp_path):

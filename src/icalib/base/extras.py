@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-from types import ModuleType
+from functools import partial
 from typing import Any
 
 from icalib.errors import RecordingError
@@ -15,22 +15,30 @@ def install(extra: str) -> str:
     return f'pip install ".[{extra}]" in the checkout of icalib'
 
 
+def _load(module: str, extra: str, need: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        raise RecordingError(f"{need}, which is not installed; run {install(extra)}.") from None
+
+
+# Functions without arguments that return these modules: deserializers of ROS messages, decompression, workers and their
+# settings, locks of files, drawing without a display, data frames.
+load_typesys = partial(_load, "rosbags.typesys", "bags", "Bags need the package rosbags")
+load_lz4 = partial(_load, "lz4.frame", "bags", "Bags compressed by lz4 need the package lz4")
+load_distributed = partial(_load, "distributed", "montecarlo", "Many runs need Dask's package distributed")
+load_dask = partial(_load, "dask", "montecarlo", "Many runs need Dask's package distributed")
+load_filelock = partial(_load, "filelock", "montecarlo", "Many runs need the package filelock")
+load_matplotlib = partial(_load, "matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
+load_pandas = partial(_load, "pandas", "pandas", "Data frames need the package pandas")
+
+
 def load_cv2() -> Any:
     """The module cv2 of OpenCV. Raises RecordingError where it is not installed."""
     # OpenCV reads these when it is loaded. The largest image takes up to 1.6 GB while it is decoded.
     for setting in ("OPENCV_IO_MAX_IMAGE_PIXELS", str(1 << 28)), ("OPENCV_LOG_LEVEL", "OFF"):
         os.environ.setdefault(*setting)
     return _load("cv2", "images", "Images and tags need OpenCV")
-
-
-def load_typesys() -> Any:
-    """The module rosbags.typesys, which deserializes ROS messages. Raises RecordingError where it is not installed."""
-    return _load("rosbags.typesys", "bags", "Bags need the package rosbags")
-
-
-def load_lz4() -> Any:
-    """The module lz4.frame. Raises RecordingError where it is not installed."""
-    return _load("lz4.frame", "bags", "Bags compressed by lz4 need the package lz4")
 
 
 def load_zstd() -> Any:
@@ -41,39 +49,7 @@ def load_zstd() -> Any:
         return _load("backports.zstd", "bags", "Bags compressed by zstd need the package backports.zstd")
 
 
-def load_distributed() -> Any:
-    """The module distributed of Dask. Raises RecordingError where it is not installed."""
-    return _load("distributed", "montecarlo", "Many runs need Dask's package distributed")
-
-
-def load_dask() -> Any:
-    """The module dask, which holds the settings of distributed. Raises RecordingError where it is not installed."""
-    return _load("dask", "montecarlo", "Many runs need Dask's package distributed")
-
-
-def load_filelock() -> Any:
-    """The module filelock. Raises RecordingError where it is not installed."""
-    return _load("filelock", "montecarlo", "Many runs need the package filelock")
-
-
-def load_matplotlib() -> Any:
-    """The module matplotlib.figure, which draws without a display. Raises RecordingError where it is not installed."""
-    return _load("matplotlib.figure", "montecarlo", "Figures as PNG need the package matplotlib")
-
-
-def load_pandas() -> Any:
-    """The module pandas, which nothing else needs. Raises RecordingError where it is not installed."""
-    return _load("pandas", "pandas", "Data frames need the package pandas")
-
-
 def load_rerun() -> Any:
     """The module rerun, with rerun.blueprint imported. Raises RecordingError where it is not installed."""
     _load("rerun.blueprint", "view", "The 3D view needs the package rerun-sdk")
     return importlib.import_module("rerun")
-
-
-def _load(module: str, extra: str, need: str) -> ModuleType:
-    try:
-        return importlib.import_module(module)
-    except ImportError:
-        raise RecordingError(f"{need}, which is not installed; run {install(extra)}.") from None

@@ -114,12 +114,15 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
         "check",
         about,
         "icalib check result new.bag",
-        "icalib check result new.bag --sigma 4 --json check.json",
+        "icalib check result new.bag --sigma 4 --json check.json --topic cam0=/left/image_raw",
         codes=codes,
     )
     c.add_argument("result", type=file_path, help="folder that a calibration was written to")
     c.add_argument("recording", type=file_path, nargs="+", help="bag or folder of a new recording of the same rig")
     add_part(c)
+    for field in ("topic", "path"):
+        text = f"{field} of a sensor in the new recording, if it is not that of the calibration; may be repeated"
+        c.add_argument(f"--{field}", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=text)
     sigma = "ignore changes that chance explains up to N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
     c.add_argument("--json", type=file_path, metavar="FILE", help="write residuals, drift and verdict as JSON")
@@ -131,12 +134,13 @@ def _check(options: argparse.Namespace) -> int:
     from icalib.base.files import refuse_foreign, set_of, write_sealed
     from icalib.cli.console import progress_bar
     from icalib.result import load_calibration
-    from icalib.tools.check import check_calibration
+    from icalib.tools.check import check_calibration, with_places
     from icalib.tools.check.words import check_json, lines
 
     if options.json:
         refuse_foreign([options.json], [*set_of(options.result), *options.recording], "choose another place")
     calibration = load_calibration(options.result)
+    calibration = with_places(calibration, topic=dict(options.topic), path=dict(options.path))
     with progress_bar(options.quiet) as progress:
         part = {"start_s": options.start_s, "end_s": options.end_s}
         check = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)

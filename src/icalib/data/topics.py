@@ -26,8 +26,8 @@ class MessageType:
     name: in ROS 2 notation. kind: the quantity that it contains, as `TopicInfo.kind`. stamped: the message has a
     header with a stamp. latched_suffix: ending of the names of topics whose messages are valid for the whole
     recording (latched); None: no topic. parsers: by encoding (ros1, cdr), function from bytes to message for types
-    unknown to rosbags; it raises ValueError. read_as: name of the type in rosbags; empty: `name`. ros1: the
-    definition, if rosbags has it for ROS 2 only.
+    unknown to rosbags; it raises ValueError. read_as: name of the type in rosbags; empty: `name`. definition: its
+    fields, one a line, if rosbags does not have them for both ROS 1 and ROS 2.
     """
 
     name: str
@@ -36,7 +36,7 @@ class MessageType:
     latched_suffix: str | None = None
     parsers: Mapping[str, Callable[[bytes], Any]] = field(default_factory=dict)
     read_as: str = ""
-    ros1: str = ""
+    definition: str = ""
 
 
 @dataclass(frozen=True)

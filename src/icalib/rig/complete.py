@@ -49,7 +49,7 @@ def _second_imu(rig: Rig) -> Iterator[Lack]:
     """Each IMU after the first: the estimator integrates only one. No other check refuses a second IMU."""
     first, *surplus = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
     for name in surplus:
-        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one of them.")
+        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one, and calibrate once for each.")
 
 
 def _unknown_frames(rig: Rig) -> Iterator[Lack]:

@@ -44,21 +44,13 @@ class TwistStream:
     angular: np.ndarray
 
 
-@dataclass(frozen=True)
-class OdometryStream:
-    """Poses of the body in the odometry frame, and its velocities in body coordinates, with the same stamps."""
-
-    pose: PoseMessages
-    twist: TwistStream
-
-
-def read_poses(bag: HasMessages, topic: str) -> PoseMessages:
-    """All PoseStamped, PoseWithCovarianceStamped or TransformStamped of `topic`. Raises RecordingError as
-    `BagRecording.messages`, and if the frame changes."""
-    stamps_ns, messages = all_messages(bag, topic, "pose")
+def read_poses(bag: HasMessages, topic: str, kind: str = "pose") -> PoseMessages:
+    """All PoseStamped, PoseWithCovarianceStamped, TransformStamped or (kind "odometry") Odometry of `topic`. Raises
+    RecordingError as `BagRecording.messages`, and if a frame changes."""
+    stamps_ns, messages = all_messages(bag, topic, kind)
     if messages and hasattr(messages[0], "child_frame_id"):
         _frame(bag, topic, messages, lambda m: m.child_frame_id)
-    return _poses(bag, topic, _frame(bag, topic, messages), stamps_ns, [_pose_of(m) for m in messages])
+    return _poses(bag, topic, _frame(bag, topic, messages), stamps_ns, [pose_of(m) for m in messages])
 
 
 @dataclass(frozen=True)
@@ -69,7 +61,8 @@ class _Placed:
     orientation: Any
 
 
-def _pose_of(message: Any) -> Any:
+def pose_of(message: Any) -> Any:
+    """The geometry_msgs/Pose of a message of one of these types."""
     if hasattr(message, "transform"):
         return _Placed(message.transform.translation, message.transform.rotation)
     return message.pose.pose if hasattr(message.pose, "pose") else message.pose
@@ -79,32 +72,19 @@ def poses_and_twists(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarra
     """Unchecked poses (N, 7) x, y, z [m] and quaternion x, y, z, w, and twists (N, 6) [m/s, rad/s] of a topic of poses
     or odometry; twists are zero where messages have none. Raises RecordingError as `BagRecording.messages`."""
     _, messages = all_messages(bag, topic, kind)
-    poses = [_pose_of(m) for m in messages]
+    poses = [pose_of(m) for m in messages]
     twists = [m.twist.twist if hasattr(m, "twist") else None for m in messages]
     rows = [(*_xyz(p.position), *_xyz(p.orientation), p.orientation.w) for p in poses]
     speeds = [(*_xyz(t.linear), *_xyz(t.angular)) if t else (0.0,) * 6 for t in twists]
     return np.array(rows).reshape(-1, 7), np.array(speeds).reshape(-1, 6)
 
 
-def read_twists(bag: HasMessages, topic: str) -> TwistStream:
-    """All TwistStamped of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, messages = all_messages(bag, topic, "twist")
-    return _twists(_frame(bag, topic, messages), stamps_ns, [m.twist for m in messages])
-
-
-def read_odometry(bag: HasMessages, topic: str) -> OdometryStream:
-    """All Odometry of `topic`. Raises RecordingError as `BagRecording.messages`, and for a frame that changes."""
-    stamps_ns, messages = all_messages(bag, topic, "odometry")
-    pose = _poses(bag, topic, _frame(bag, topic, messages), stamps_ns, [m.pose.pose for m in messages])
-    body = _frame(bag, topic, messages, lambda m: m.child_frame_id)
-    return OdometryStream(pose, _twists(body, stamps_ns, [m.twist.twist for m in messages]))
-
-
-def read_odometry_twists(bag: HasMessages, topic: str) -> TwistStream:
-    """Velocities of all Odometry messages of `topic`, poses unchecked. Raises RecordingError as `read_twists`."""
-    stamps_ns, messages = all_messages(bag, topic, "odometry")
-    frame = _frame(bag, topic, messages, lambda m: m.child_frame_id)
-    return _twists(frame, stamps_ns, [m.twist.twist for m in messages])
+def read_twists(bag: HasMessages, topic: str, kind: str = "twist") -> TwistStream:
+    """All TwistStamped, or velocities of all Odometry (kind "odometry"), of `topic`; poses are not checked. Raises
+    RecordingError as `BagRecording.messages`, and for a frame that changes."""
+    stamps_ns, messages = all_messages(bag, topic, kind)
+    frame = _frame(bag, topic, messages, lambda m: getattr(m, "child_frame_id", m.header.frame_id))
+    return _twists(frame, stamps_ns, [getattr(m.twist, "twist", m.twist) for m in messages])
 
 
 def all_messages(bag: HasMessages, topic: str, kind: str) -> tuple[np.ndarray, list[Any]]:

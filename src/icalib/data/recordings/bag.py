@@ -211,8 +211,9 @@ def _stores() -> dict[str, Any]:
     typesys = load_typesys()
     ros1, ros2 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS1_NOETIC, typesys.Stores.ROS2_HUMBLE))
     for known in message_types().values():
-        if known.ros1:
-            ros1.register(typesys.get_types_from_msg(known.ros1, known.read_as or known.name))
+        if known.definition:
+            for store in (ros1, ros2):
+                store.register(typesys.get_types_from_msg(known.definition, known.read_as or known.name))
     return {"ros1": ros1.deserialize_ros1, "cdr": ros2.deserialize_cdr}
 
 

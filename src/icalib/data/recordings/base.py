@@ -108,7 +108,8 @@ class Recording(ABC):
 
     def where(self, sensor: Sensor) -> str:
         """Name of the source of the sensor's data in messages, such as the file. Raises RecordingError without data."""
-        return facet(sensor.sensor_type, "read").where(self, sensor)
+        source: Path | TopicInfo | str = facet(sensor.sensor_type, "read").source(self, sensor)
+        return self.place(source.name) if isinstance(source, TopicInfo) else str(source)
 
     def image_topics(self) -> tuple[TopicInfo, ...]:
         """Topics of kind "image"."""

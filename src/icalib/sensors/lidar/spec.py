@@ -34,7 +34,9 @@ class Lidar(MountedSensor):
     sensor_type: ClassVar[str] = "lidar"
     noun: ClassVar[str] = "LiDAR"
     gives_motion: ClassVar[bool] = True
-    needs_imu: ClassVar[bool] = True
+    needs_imu: ClassVar[str] = (
+        "or run LiDAR odometry, and give its nav_msgs/Odometry as a sensor of type: pose, kind: relative"
+    )
     shows_planes: ClassVar[bool] = True
 
     path: str

@@ -1,17 +1,19 @@
-"""Topics and tables of a recording that can be position sensors: NavSatFix, PointStamped, RTKLIB files, tables."""
+"""Topics and tables of a recording that can be position sensors: fixes, points, RTKLIB files, tables."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import numpy as np
 
 from icalib.data.messages import poses_and_twists
-from icalib.data.recordings import Recording
+from icalib.data.recordings import Recording, TopicInfo
+from icalib.sensors.position.read import RECEIVER_KINDS, first_kinds
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.facts import SensorSource, Sources
-from icalib.tools.inspection.kinds import KindInspector
+from icalib.tools.inspection.kinds import Key, KindInspector
 
 
 class PositionInspector(KindInspector):
@@ -19,14 +21,21 @@ class PositionInspector(KindInspector):
     clicked on."""
 
     sensor: ClassVar[type[Sensor]] = PositionSensor
-    topic_kinds: ClassVar[tuple[str, ...]] = ("navsat", "point", "position")
+    topic_kinds: ClassVar[tuple[str, ...]] = ("navsat", "point", "position", *RECEIVER_KINDS)
     prefix: ClassVar[str] = "gnss"
-    plain_names: ClassVar[str] = r"positions\.csv|[^/]*\.pos|fix|navsat(fix)?|point|position"
+    plain_names: ClassVar[str] = (
+        r"positions\.csv|[^/]*\.pos|.*\.(nmea|txt)|(gps|extended_)?fix|navsat(fix)?|navpvt|nmea(_sentence)?|point|position"
+    )
     moves_with_wheels: ClassVar[bool] = True
     doubt: ClassVar[tuple[str, ...]] = (
         "Positions of something on the robot: an antenna, a prism, a tag? Then remove the #;",
         "the lever arm and the clock are calibrated (docs/rig-file.md#position-sensor).",
     )
+
+    def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, SensorSource]]:
+        """See `KindInspector`. A receiver's messages are left out beside others that may hold the same fixes."""
+        unused = {*RECEIVER_KINDS} - {*first_kinds(topics)}
+        return super().sources([topic for topic in topics if topic.kind not in unused])
 
     def joined(self, recording: Recording, sources: Sources) -> Sources:
         """The sources; poses of a bag whose rotation is unknown or never changes are positions."""

@@ -89,6 +89,10 @@ class Ground:
     bump_noise: float = 3e-3  # m
 
 
+NO_SIDEWAYS = (
+    "icalib has no model of mecanum and omni wheels; give their nav_msgs/Odometry as a sensor of type: pose, "
+    "kind: relative"
+)
 _WORDS = (
     "path", "topic", "drive", "measures", "sampling", "counts_per_turn", "counter_size", "angle_range", "rate_unit",
     "signs", "joints", "factor",
@@ -215,6 +219,8 @@ class Wheels(MountedSensor):
             (*_WORDS, "ground", *_NOISES, *_SLIP, *TABLE, *parameter_fields(cls)),
         )
         measures: WheelMeasure = choice_or(fields, "measures", WheelMeasure, cls.measures)
+        if "drive" in fields and fields["drive"].text() in ("mecanum", "omni", "omnidirectional", "holonomic"):
+            fields["drive"].fail(f"{NO_SIDEWAYS}.")
         drive: WheelDrive = choice_or(fields, "drive", WheelDrive, cls.drive)
         bare = cls(name, "", drive, measures=measures)
         _refuse_other_measures(value, fields, bare)

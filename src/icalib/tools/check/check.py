@@ -8,8 +8,8 @@ second solve with the old values fixed gives the residuals of the old calibratio
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import inf
 from statistics import NormalDist
 from typing import Literal
@@ -99,6 +99,17 @@ def check_calibration(
     return check_measurements(
         calibration, read, lambda s, done: progress(s, READING_SHARE + (1.0 - READING_SHARE) * done), sigma=sigma
     )
+
+
+def with_places(calibration: Calibration, **fields: Mapping[str, str]) -> Calibration:
+    """The calibration, for a check on a recording with another `topic` or `path` of sensors. fields: values by sensor.
+    Raises CalibrationError for a sensor that it does not have."""
+    sensors = dict(calibration.rig["sensors"])
+    for field, name, place in ((field, *item) for field, places in fields.items() for item in places.items()):
+        if name not in sensors:
+            raise CalibrationError(f"the calibration has no sensor {name}; it has {', '.join(sensors)}.")
+        sensors[name] = sensors[name] | {field: place}
+    return replace(calibration, rig={**calibration.rig, "sensors": sensors})
 
 
 def check_measurements(

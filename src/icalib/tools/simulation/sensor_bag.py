@@ -9,14 +9,16 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.files import write_new
 from icalib.data.measurements import ImuStream
 from icalib.errors import RigError
 from icalib.tools.simulation.images.filming import Film
 from icalib.tools.simulation.images.rendering import Imaging
 from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagWriter
+from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario.sensor import BagTopic
 from icalib.tools.simulation.sensors.simulate import Simulation
-from icalib.tools.simulation.tables import atomic_output, write_truth
+from icalib.tools.simulation.tables import atomic_output, check_absent, write_truth
 
 Event = tuple[int, str, Callable[[BagWriter], Any]]  # instant on the IMU's clock [ns], topic, maker of the message
 _EXPOSURE_S = 0.004
@@ -27,7 +29,7 @@ def write_sensors(
     simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
 ) -> tuple[str, ...]:
     """Writes an MCAP bag, its truth and its rig file to the new folder `path`, atomically. If `path` ends with .bag,
-    it is a ROS 1 bag without them.
+    it is a ROS 1 bag, with only the rig file beside it, as `run.rig.yaml`.
 
     Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
     or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
@@ -35,7 +37,9 @@ def write_sensors(
     """
     if any(simulation.scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
-    ros1 = path.suffix == ".bag"
+    ros1, rig = path.suffix == ".bag", path.with_suffix(".rig.yaml")
+    if ros1:
+        check_absent(rig)
     topics, streams, notes = _streams(simulation, seed)
     last_ns = simulation.truth.imu_clock_origin_ns + int(simulation.truth.seconds[-1] * 1e9)
     span_ns = max(last_ns - simulation.truth.imu_clock_origin_ns, 1)
@@ -46,6 +50,9 @@ def write_sensors(
                 progress(1.0 - (last_ns - at_ns) / span_ns)
         if not ros1:
             write_truth(simulation, seed, place, topics)
+    if ros1:
+        write_new(rig, rig_text(simulation.scenario, topics))
+        notes += (f"the rig file of the bag is {rig}.",)
     return notes
 
 

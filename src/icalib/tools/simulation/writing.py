@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -23,7 +23,7 @@ Reading = tuple[int, list[float]]  # stamp [ns]; gyro, accel
 class _Sink(AbstractContextManager["_Sink"], Protocol):
     """A recording that is being written. received_ns: instant of reception on the IMU's clock [ns]."""
 
-    def image(self, shot: Shot, received_ns: int) -> None: ...
+    def shot(self, shot: Shot, received_ns: int) -> None: ...
 
     def reading(self, reading: Reading) -> None: ...
 
@@ -44,53 +44,34 @@ def write_film(film: Film, paths: Mapping[Form, Path], workers: int | None = Non
         for received_ns, event in _in_time(film, workers):
             for sink in sinks:
                 if isinstance(event, Shot):
-                    sink.image(event, received_ns)
+                    sink.shot(event, received_ns)
                 else:
                     sink.reading(event)
 
 
 def _in_time(film: Film, workers: int | None) -> Iterator[tuple[int, Shot | Reading]]:
     """Images and readings in order of time, each with its instant on the IMU's clock [ns]."""
-    values = np.concatenate([film.imu.gyro, film.imu.accel], axis=1)
-    readings = zip(film.imu.stamps_ns.tolist(), values.tolist(), strict=True)
-    next_reading = next(readings, None)
-    for shot in film.shots(workers):
-        taken_ns = film.truth.imu_clock_origin_ns + round(shot.seconds * 1e9)
-        while next_reading is not None and next_reading[0] <= taken_ns:
-            yield next_reading[0], next_reading
-            next_reading = next(readings, None)
-        yield taken_ns, shot
-    while next_reading is not None:
-        yield next_reading[0], next_reading
-        next_reading = next(readings, None)
+    values = np.concatenate([film.imu.gyro, film.imu.accel], axis=1).tolist()
+    readings = ((stamp, (stamp, row)) for stamp, row in zip(film.imu.stamps_ns.tolist(), values, strict=True))
+    shots = ((film.truth.imu_clock_origin_ns + round(shot.seconds * 1e9), shot) for shot in film.shots(workers))
+    return heapq.merge(readings, shots, key=lambda event: event[0])
 
 
 def _sink(form: Form, path: Path, cameras: list[str]) -> _Sink:
     return _Folder(path, cameras) if form == "euroc" else _FilmBag(form, path, cameras)
 
 
-class _FilmBag:
+class _FilmBag(BagWriter):
     """A bag of images and readings."""
 
     def __init__(self, form: BagForm, path: Path, cameras: list[str]) -> None:
-        self._bag = BagWriter(form, path, {IMU_TOPIC: IMU} | {_image_topic(name): IMAGE for name in cameras})
+        super().__init__(form, path, {IMU_TOPIC: IMU} | {_image_topic(name): IMAGE for name in cameras})
 
-    def __enter__(self) -> _FilmBag:
-        self._bag.__enter__()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bag.__exit__(kind, error, trace)
-
-    def image(self, shot: Shot, received_ns: int) -> None:
-        message = self._bag.image(shot.stamp_ns, shot.camera, shot.pixels)
-        self._bag.write(_image_topic(shot.camera), message, received_ns)
+    def shot(self, shot: Shot, received_ns: int) -> None:
+        self.write(_image_topic(shot.camera), self.image(shot.stamp_ns, shot.camera, shot.pixels), received_ns)
 
     def reading(self, reading: Reading) -> None:
-        stamp_ns, values = reading
-        self._bag.write(IMU_TOPIC, self._bag.imu(stamp_ns, values), stamp_ns)
+        self.write(IMU_TOPIC, self.imu(*reading), reading[0])
 
 
 class _Folder:
@@ -112,12 +93,10 @@ class _Folder:
             table.write(header + "\n")
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._stack.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._stack.__exit__(*error)
 
-    def image(self, shot: Shot, received_ns: int) -> None:
+    def shot(self, shot: Shot, received_ns: int) -> None:
         name = f"{shot.stamp_ns}.png"
         done, data = self._cv2.imencode(".png", shot.pixels)
         assert done

@@ -66,11 +66,11 @@ def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> l
     if reading.rig.cameras_alone:
         return [*streams]
     names = {stream.name for stream, _ in streams}
-    sources = {c.name: f"{where(recording, c)} ({c.name})" for c in sensors if c.name in names}
+    sources = {c.name: f"{source(recording, c)} ({c.name})" for c in sensors if c.name in names}
     return [*with_even_stamps(streams, sources)]
 
 
-def where(recording: Recording, camera: Camera) -> str:
+def source(recording: Recording, camera: Camera) -> str:
     """Text that names the source of the camera's corners in messages: its table, or its image topic."""
     if has_corners(recording, camera):
         return str(recording.table(camera, camera.path))

@@ -99,7 +99,7 @@ def _from_tables(recording: Recording, sensor: ImuSensor) -> ImuStream | ImuHalv
     return recording.inside(ImuStream(sensor.name, stamps_ns, values[:, :3].copy(), values[:, 3:].copy()), path)
 
 
-def where(recording: Recording, sensor: ImuSensor) -> str:
+def source(recording: Recording, sensor: ImuSensor) -> str:
     """Topics or table files of the IMU, as text for messages."""
     if recording.has_messages:
         topic = imu_source(str(recording.root), recording, recording.topics(), sensor)

@@ -9,7 +9,7 @@ import numpy as np
 
 from icalib.data.recordings.base import Reading, ReadStream, Recording
 from icalib.data.tables.table import TableFile
-from icalib.data.topics import MessageType, UnreadType
+from icalib.data.topics import MessageType, TopicInfo, UnreadType
 from icalib.sensors.lidar.read import livox
 from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted
 from icalib.sensors.lidar.read.point_clouds import point_clouds, read_clouds
@@ -29,6 +29,12 @@ UNREAD = (
         "points",
         "raw packets of a LiDAR; replay the recording with the LiDAR's driver, and record the sensor_msgs/PointCloud2 "
         "that it sends",
+    ),
+    UnreadType(
+        r"sensor_msgs/msg/(MultiEcho)?LaserScan",
+        "points",
+        "scans of one plane, and icalib needs a 3D LiDAR's sensor_msgs/PointCloud2; run scan matching, and give its "
+        "nav_msgs/Odometry as a sensor of type: pose, kind: relative",
     ),
     UnreadType(
         r"\.(pcd|ply|las|laz) files",
@@ -65,13 +71,11 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
 
     Raises RecordingError naming file or topic if the data are missing or cannot be read, or point times are unknown.
     """
-    if recording.has_messages:
-        topic = _topic(recording, sensor)
-        what = f"{recording.place(topic)} ({sensor.name})"
-        stream, notes = read_clouds(point_clouds(recording, topic), sensor, what)
+    path, what = source(recording, sensor), f"{recording.where(sensor)} ({sensor.name})"
+    if isinstance(path, TopicInfo):
+        stream, notes = read_clouds(point_clouds(recording, path.name), sensor, what)
     else:
-        path = recording.table(sensor, sensor.path)
-        sieve, what = Sieve(sensor.min_range_m, sensor.max_range_m), f"{path} ({sensor.name})"
+        sieve = Sieve(sensor.min_range_m, sensor.max_range_m)
         stream, notes = in_seconds(recording.inside(read_scans(sensor.name, path), path), sensor, what)
         stream = sifted(stream, sieve)
         notes += (sieve.note(what),)
@@ -80,13 +84,8 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
     return stream
 
 
-def where(recording: Recording, sensor: Lidar) -> str:
-    """File or topic of the scans, as text for messages."""
+def source(recording: Recording, sensor: Lidar) -> Path | TopicInfo:
+    """File or topic of the scans."""
     if recording.has_messages:
-        return recording.place(_topic(recording, sensor))
-    return str(recording.table(sensor, sensor.path))
-
-
-def _topic(recording: Recording, sensor: Lidar) -> str:
-    """Name of the topic of clouds."""
-    return recording.topic(sensor.name, sensor.topic, "points").name
+        return recording.topic(sensor.name, sensor.topic, "points")
+    return recording.table(sensor, sensor.path)

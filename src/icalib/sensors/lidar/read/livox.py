@@ -9,6 +9,7 @@ CustomPoint: uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, t
 from __future__ import annotations
 
 import struct
+from collections import namedtuple
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,20 +19,8 @@ _POINT_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflecti
 _POINT_BYTES = 19  # size of a point; in CDR padded to a multiple of 4
 
 
-@dataclass(frozen=True)
-class Stamp:
-    """Seconds and nanoseconds since 1970."""
-
-    sec: int
-    nanosec: int
-
-
-@dataclass(frozen=True)
-class Header:
-    """Header of a message, with the field names of ROS."""
-
-    stamp: Stamp
-    frame_id: str
+# Stamp [s, ns since 1970] and header of a message, with the field names of ROS.
+Stamp, Header = namedtuple("Stamp", "sec nanosec"), namedtuple("Header", "stamp frame_id")
 
 
 @dataclass(frozen=True)

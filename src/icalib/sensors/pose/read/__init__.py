@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.messages import read_odometry, read_poses
+from icalib.data.messages import read_poses
 from icalib.data.recordings.base import Reading, ReadStream, Recording
 from icalib.data.tables.table import TableFile, holds
 from icalib.data.topics import MessageType, TopicInfo
@@ -35,7 +35,7 @@ from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import TableLayout
 
 _TRANSFORMS = MessageType(
-    MESSAGE_TYPE, TRANSFORMS, stamped=False, latched_suffix="tf_static", read_as=MESSAGE_TYPE, ros1=MESSAGE
+    MESSAGE_TYPE, TRANSFORMS, stamped=False, latched_suffix="tf_static", read_as=MESSAGE_TYPE, definition=MESSAGE
 )
 MESSAGES = (
     MessageType("geometry_msgs/msg/PoseStamped", "pose"),
@@ -99,33 +99,21 @@ def readings(recording: Recording, sensor: PoseSensor) -> PoseReadings:
                 "give the bag, or remove `frames` from the rig file."
             )
         return read_transform_poses(recording, sensor, recording.note)
-    if _is_table(recording, sensor):
-        path = recording.table(sensor, sensor.path)
-        return recording.inside(
-            read_pose_file(sensor.name, path, sensor.layout, recording.note, sensor.rotations), path
-        )
-    topic = _topic(recording, sensor)
-    poses = read_odometry(recording, topic.name).pose if topic.kind == "odometry" else read_poses(recording, topic.name)
+    topic = source(recording, sensor)
+    if isinstance(topic, Path):
+        poses = read_pose_file(sensor.name, topic, sensor.layout, recording.note, sensor.rotations)
+        return recording.inside(poses, topic)
+    poses = read_poses(recording, topic.name, topic.kind)
     order = recording.by_stamp(topic.name, poses.stamps_ns)
     return PoseReadings(sensor.name, poses.stamps_ns[order], poses.rotation[order], poses.position[order])
 
 
-def where(recording: Recording, sensor: PoseSensor) -> str:
-    """Words for the file or topic of the poses."""
-    if _is_table(recording, sensor):
-        return str(recording.table(sensor, sensor.path))
-    return recording.place(_topic(recording, sensor).name)
-
-
-def _is_table(recording: Recording, sensor: PoseSensor) -> bool:
-    """Whether the poses come from a table."""
-    if not recording.has_messages:
-        return True
-    return sensor.topic is None and sensor.frames is None and recording.find(sensor.path) is not None
-
-
-def _topic(recording: Recording, sensor: PoseSensor) -> TopicInfo:
-    """The topic of poses or odometry; the topic of transforms if the sensor has `frames`."""
+def source(recording: Recording, sensor: PoseSensor) -> Path | TopicInfo:
+    """The table, which may be next to a bag, or the topic: of transforms if the sensor has `frames`, else of poses or
+    odometry."""
+    in_bag = sensor.topic is not None or sensor.frames is not None
+    if not recording.has_messages or not (in_bag or recording.find(sensor.path) is None):
+        return recording.table(sensor, sensor.path)
     if sensor.frames is not None:
         return recording.topic(sensor.name, sensor.topic or DEFAULT_TOPIC, TRANSFORMS)
     refuse_without_frames(recording.root, recording.topics(), sensor)

@@ -1,23 +1,25 @@
-"""Reads tables, solutions of RTKLIB and messages into checked streams of positions.
+"""Reads tables, solutions of RTKLIB, logs of NMEA and messages into checked streams of positions.
 
 Checks of fixes: stamps, units, motion, repeated fixes, outliers, steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from icalib.data.images.image_checks import Note, ignore
 from icalib.data.recordings.base import Reading, ReadStream, Recording
 from icalib.data.stamps.ordered import kept_readings, true_runs
 from icalib.data.tables.table import TableFile, named
-from icalib.data.topics import MessageType, TopicInfo
+from icalib.data.topics import TopicInfo
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import east_north_up, latitude_longitude
+from icalib.sensors.position.read.fixes import FIX_TYPES, NAVSAT, POINT, RECEIVER, SENTENCE, is_nmea, read_nmea
 from icalib.sensors.position.read.outliers import single_wrong, steps
 from icalib.sensors.position.read.readings import (
     AS_RECORDED,
@@ -25,10 +27,10 @@ from icalib.sensors.position.read.readings import (
     GEODETIC,
     LocalFrame,
     PositionReadings,
+    Recorded,
     about_first,
+    from_fixes,
     from_geodetic,
-    from_navsat,
-    from_positions,
     good_fixes,
     left_out,
     read_position_table,
@@ -38,26 +40,23 @@ from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TableLayout
 
-NAVSAT, POINT = "navsat", "point"
-POSITION_KINDS = (NAVSAT, POINT)  # kinds of topics with positions alone
-POSE_KINDS = ("pose", "odometry")  # kinds of topics with poses
-MESSAGES = (
-    MessageType("sensor_msgs/msg/NavSatFix", NAVSAT),
-    MessageType("geometry_msgs/msg/PointStamped", POINT),
-)
+# Kinds of topics. Where a bag has several, the first is used: a driver may publish the fixes of one receiver as all.
+RECEIVER_KINDS = (RECEIVER, SENTENCE)
+POSITION_KINDS = ((NAVSAT, POINT), *((kind,) for kind in RECEIVER_KINDS), ("pose", "odometry"))
+METRIC_KINDS = (POINT, *POSITION_KINDS[-1])
+MESSAGES = tuple(message for message, _ in FIX_TYPES.values())
 Noted = tuple[PositionReadings, tuple[str, ...]]
 
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
-    if _is_solution(path):
-        return read_pos(path).stamps_ns
-    return read_position_table(PositionSensor(path.parent.name, str(path), layout=layout), path)[0].stamps_ns
+    return _of_file(PositionSensor(path.parent.name, str(path), layout=layout), path, ignore)[0].stamps_ns
 
 
 TABLES = (
     TableFile("positions.csv", "table of positions", "position", _stamps),
     TableFile("*[Gg][NnPp][Ss]*.csv", "table of positions", "position", _stamps, partial(named, kind=GEODETIC)),
     TableFile(f"*{SUFFIX}", "solution of RTKLIB", "position", _stamps),
+    *(TableFile(name, "log of NMEA sentences", "position", _stamps, is_nmea) for name in ("*.nmea", "*.txt")),
 )
 
 
@@ -80,68 +79,61 @@ def read(recording: Recording, sensors: Sequence[PositionSensor], reading: Readi
     return streams
 
 
-def where(recording: Recording, sensor: PositionSensor) -> str:
-    """Path of the table, or place of the topic, with the sensor's positions, for messages."""
-    if _is_table(recording, sensor):
-        return str(recording.table(sensor, sensor.path))
-    return recording.place(_topic(recording, sensor).name)
-
-
-def _is_table(recording: Recording, sensor: PositionSensor) -> bool:
-    return not recording.has_messages or (sensor.topic is None and recording.find(sensor.path) is not None)
-
-
-def _is_solution(path: Path) -> bool:
-    return path.name.removesuffix(".gz").endswith(SUFFIX)
-
-
-def _topic(recording: Recording, sensor: PositionSensor) -> TopicInfo:
-    """The topic of a sensor. Messages with positions alone go before poses and odometry."""
-    has_positions = any(t.kind in POSITION_KINDS and t.count for t in recording.topics())
-    kinds = POSITION_KINDS if has_positions and sensor.topic is None else (*POSITION_KINDS, *POSE_KINDS)
+def source(recording: Recording, sensor: PositionSensor) -> Path | TopicInfo:
+    """The table, which may be next to a bag, or the topic, of the first of `POSITION_KINDS` that the recording has."""
+    if not recording.has_messages or (sensor.topic is None and recording.find(sensor.path) is not None):
+        return recording.table(sensor, sensor.path)
+    kinds = first_kinds(recording.topics()) if sensor.topic is None else sum(POSITION_KINDS, ())
     return recording.topic(sensor.name, sensor.topic, *kinds)
+
+
+def first_kinds(topics: Iterable[TopicInfo]) -> tuple[str, ...]:
+    """The first of `POSITION_KINDS` with messages; all of them if there are none."""
+    recorded = {topic.kind for topic in topics if topic.count}
+    return next((kinds for kinds in POSITION_KINDS if recorded & {*kinds}), sum(POSITION_KINDS, ()))
 
 
 def _readings(recording: Recording, sensor: PositionSensor, what: str) -> Noted:
     """Readings in metres, and notes; what: names the source in messages."""
-    if not _is_table(recording, sensor):
-        return _of_topic(recording, sensor, _topic(recording, sensor), what)
-    path = recording.table(sensor, sensor.path)
-    if _is_solution(path):
-        return _of_solution(recording, sensor, path, what)
-    written, geodetic = read_position_table(sensor, path, recording.note)
-    written = recording.inside(written, path)
-    if not geodetic:
-        return about_first(what, written)
-    return from_geodetic(what, written, written.position, np.ones(len(written.stamps_ns), dtype=bool))
+    path = source(recording, sensor)
+    if isinstance(path, TopicInfo):
+        return _of_topic(recording, sensor, path, what)
+    written, coordinates = _of_file(sensor, path, recording.note)
+    return _in_metres(recording.inside(written, path), coordinates, sensor, what)
+
+
+def _of_file(sensor: PositionSensor, path: Path, note: Note) -> tuple[PositionReadings, Recorded]:
+    """The readings in a file, and their coordinates."""
+    if is_nmea(path):
+        return from_fixes(sensor.name, read_nmea(path, note)), "geodetic"
+    if path.name.removesuffix(".gz").endswith(SUFFIX):
+        return read_pos(sensor.name, path)
+    return read_position_table(sensor, path, note)
 
 
 def _of_topic(recording: Recording, sensor: PositionSensor, topic: TopicInfo, what: str) -> Noted:
-    messages = list(recording.messages(topic.name, topic.kind))
-    order = recording.by_stamp(topic.name, np.array([stamp for stamp, _ in messages], np.int64))
-    messages = [messages[k] for k in order.tolist()]
-    if topic.kind != NAVSAT:
-        return about_first(what, from_positions(sensor.name, messages))
-    written, degrees = from_navsat(sensor.name, messages)
-    good = good_fixes(written.status, sensor.least_status, len(degrees))
-    readings, notes = from_geodetic(what, written, degrees, good)
-    return readings, left_out(what, written.status, good, sensor.least_status) + notes
-
-
-def _of_solution(recording: Recording, sensor: PositionSensor, path: Path, what: str) -> Noted:
-    file = read_pos(path)
-    written = PositionReadings(sensor.name, file.stamps_ns, file.values, file.covariance, file.status)
-    written = recording.inside(written, path)
-    good = good_fixes(written.status, sensor.least_status, len(written.stamps_ns))
-    notes = left_out(what, written.status, good, sensor.least_status)
-    if file.kind == "geodetic":
-        readings, more = from_geodetic(what, written, written.position, good)
-        return readings, notes + more
-    written = written.some(good)
-    if file.kind == "earth" and len(written.stamps_ns):
-        written = _levelled(written)
-    readings, more = about_first(what, written)
+    message, fix_of = FIX_TYPES[topic.type]
+    fixes = [(stamp_ns, fix) for stamp_ns, fix in recording.messages(topic.name, topic.kind, fix_of) if fix is not None]
+    notes: tuple[str, ...] = ()
+    if not message.stamped:
+        timed = [(fix.utc_ns, fix) for _, fix in fixes if fix.utc_ns is not None]
+        unknown = f"; {len(fixes) - len(timed)} fixes without it were left out" if len(timed) < len(fixes) else ""
+        fixes, notes = timed, (f"{what}: its stamps are the receiver's time (UTC){unknown}.",)
+    order = recording.by_stamp(topic.name, np.array([stamp_ns for stamp_ns, _ in fixes], np.int64))
+    written = from_fixes(sensor.name, [fixes[k] for k in order.tolist()])
+    readings, more = _in_metres(written, "local" if topic.kind in METRIC_KINDS else "geodetic", sensor, what)
     return readings, notes + more
+
+
+def _in_metres(written: PositionReadings, coordinates: Recorded, sensor: PositionSensor, what: str) -> Noted:
+    """The good readings in metres, and notes."""
+    good = good_fixes(written.status, sensor.least_status, len(written.stamps_ns))
+    if coordinates == "geodetic":
+        readings, notes = from_geodetic(what, written, good)
+    else:
+        some = written.some(good)
+        readings, notes = about_first(what, _levelled(some) if coordinates == "earth" and good.any() else some)
+    return readings, left_out(what, written.status, good, sensor.least_status) + notes
 
 
 def _levelled(written: PositionReadings) -> PositionReadings:

@@ -1,15 +1,15 @@
 """Fixes as recorded, and as positions in metres relative to the first good one.
 
-Positions in messages of a bag: NavSatFix, PointStamped, poses and Odometry. Tables of positions: metric x, y, z, or
-latitude, longitude and height; with standard deviations where a header names them.
+Tables of positions: metric x, y, z, or latitude, longitude and height; with standard deviations where a header names
+them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
@@ -18,10 +18,12 @@ from icalib.data.tables.columns import STAMP, TableKind, places_by_name
 from icalib.data.tables.table import named, read_table
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import earth_centred, local_metres
+from icalib.sensors.position.read.fixes import RecordedFix
 from icalib.sensors.position.spec import STATUSES, PositionSensor, Status
 from icalib.sensors.stream import RawReadings
 
 NO_COVARIANCE = np.zeros((0, 3, 3))
+Recorded = Literal["geodetic", "earth", "local"]  # coordinates; latitude, longitude and height; Earth-centred; metric
 MAX_DISTANCE_M = 20_000.0  # from the first fix: the vertical turns by 3 mrad, which is 0.03 m/s^2 of gravity
 
 
@@ -80,14 +82,13 @@ def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> 
     return (f"{what}: {none + worse} of {len(good)} positions were left out, {' and '.join(parts)}.",)
 
 
-def from_geodetic(
-    what: str, readings: PositionReadings, degrees: np.ndarray, good: np.ndarray
-) -> tuple[PositionReadings, tuple[str, ...]]:
+def from_geodetic(what: str, readings: PositionReadings, good: np.ndarray) -> tuple[PositionReadings, tuple[str, ...]]:
     """Those of `readings` that are `good` (N,) bool, in metres east, north and up of the first, and a note. Covariances
-    are in these axes already. degrees (N, 3): latitude and longitude [deg], height over the WGS84 ellipsoid [m].
+    are in these axes already, positions latitude and longitude [deg] and height over the WGS84 ellipsoid [m].
 
     Raises RecordingError where latitudes, longitudes or heights cannot be right.
     """
+    degrees = readings.position
     usable = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
     _refuse_heights(what, degrees, good)
     if not usable.any():
@@ -141,58 +142,21 @@ def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings
     return replace(readings, position=p - origin, frame=readings.frame.moved(origin)), (note,)
 
 
-# NavSatStatus: -1 no fix, 0 fix, 1 satellite-based, 2 ground-based augmentation (where receivers report RTK).
-_NAVSAT_STATUS = {0: STATUSES.index("single"), 1: STATUSES.index("differential"), 2: STATUSES.index("fixed")}
-COVARIANCE_UNKNOWN = 0
+def from_fixes(name: str, stamped: Sequence[tuple[int, RecordedFix]]) -> PositionReadings:
+    """Readings of fixes with their stamps [ns], geodetic ones not yet in metres."""
+    fixes = [fix for _, fix in stamped]
+    position = np.array([fix.position for fix in fixes]).reshape(-1, 3)
+    covariance = np.array([fix.covariance for fix in fixes]).reshape(-1, 3, 3)
+    status = np.array([fix.status for fix in fixes], np.int64)
+    usable = usable_covariances(covariance, (status >= 0) & np.isfinite(position).all(axis=1))
+    return PositionReadings(name, np.array([stamp for stamp, _ in stamped], np.int64), position, usable, status)
 
 
-def from_navsat(name: str, stamped: Iterable[tuple[int, Any]]) -> tuple[PositionReadings, np.ndarray]:
-    """Readings of sensor_msgs/NavSatFix, not yet in metres; and latitude, longitude [deg], height [m] (N, 3)."""
-    messages = list(stamped)
-    stamps_ns = np.array([stamp for stamp, _ in messages], np.int64)
-    degrees = np.array([(m.latitude, m.longitude, m.altitude) for _, m in messages]).reshape(-1, 3)
-    status = np.array([_NAVSAT_STATUS.get(int(m.status.status), -1) for _, m in messages], np.int64)
-    covariance = np.array([np.asarray(m.position_covariance, float).reshape(3, 3) for _, m in messages]).reshape(
-        -1, 3, 3
-    )
-    known = np.array([int(m.position_covariance_type) != COVARIANCE_UNKNOWN for _, m in messages], bool)
-    fixed = (status >= 0) & np.isfinite(degrees).all(axis=1)
-    return PositionReadings(name, stamps_ns, degrees, _usable(covariance, known, fixed), status), degrees
-
-
-def from_positions(name: str, messages: Iterable[tuple[int, Any]]) -> PositionReadings:
-    """Readings of PointStamped, PoseStamped, PoseWithCovarianceStamped, TransformStamped or Odometry."""
-    stamps, positions, covariances = [], [], []
-    for stamp, message in messages:
-        stamps.append(stamp)
-        point, covariance = _point(message)
-        positions.append((point.x, point.y, point.z))
-        covariances.append(
-            np.zeros((3, 3)) if covariance is None else np.asarray(covariance, float).reshape(6, 6)[:3, :3]
-        )
-    position, covariance = np.array(positions).reshape(-1, 3), np.array(covariances).reshape(-1, 3, 3)
-    everything = np.ones(len(stamps), bool)
-    usable = _usable(covariance, everything, everything)
-    return PositionReadings(name, np.array(stamps, np.int64), position, usable, np.zeros(0, np.int64))
-
-
-def _point(message: Any) -> tuple[Any, Any]:
-    """The position of a message, and its covariance (36,) where it has one."""
-    if hasattr(message, "point"):
-        return message.point, None
-    if hasattr(message, "transform"):
-        return message.transform.translation, None
-    if hasattr(message.pose, "pose"):
-        return message.pose.pose.position, message.pose.covariance
-    return message.pose.position, None
-
-
-def _usable(covariance: np.ndarray, known: np.ndarray, needed: np.ndarray) -> np.ndarray:
-    """The covariances (N, 3, 3), or NO_COVARIANCE unless all that are `needed` (N,) are known and positive definite."""
+def usable_covariances(covariance: np.ndarray, needed: np.ndarray) -> np.ndarray:
+    """The covariances (N, 3, 3), or NO_COVARIANCE unless all that are `needed` (N,) are positive definite."""
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
     finite = np.where(np.isfinite(covariance), covariance, 0.0)
-    good = known & (np.linalg.eigvalsh(finite)[:, 0] > 0.0) if len(finite) else known
-    if not needed.any() or not good[needed].all():
+    if not needed.any() or not (np.linalg.eigvalsh(finite[needed])[:, 0] > 0.0).all():
         return NO_COVARIANCE
     return np.where(needed[:, None, None], finite, np.eye(3))
 
@@ -228,9 +192,9 @@ _DEVIATIONS = (
 )
 
 
-def read_position_table(sensor: PositionSensor, path: Path, note: Note = ignore) -> tuple[PositionReadings, bool]:
-    """The positions in a table, and whether they are latitude, longitude and height: as the rig file says, or as the
-    names of the columns do. Standard deviations are those of east, north and up, or of x, y and z. Raises
+def read_position_table(sensor: PositionSensor, path: Path, note: Note = ignore) -> tuple[PositionReadings, Recorded]:
+    """The positions in a table, and their coordinates, geodetic or local, as the rig file or the names of the columns
+    say. Standard deviations are those of east, north and up, or of x, y and z. Raises
     RecordingError naming file and line."""
     layout, geodetic = sensor.layout, sensor.coordinates == "geodetic"
     if sensor.coordinates is None:
@@ -246,7 +210,7 @@ def read_position_table(sensor: PositionSensor, path: Path, note: Note = ignore)
     readings = PositionReadings(
         sensor.name, table.integers[:, 0].copy(), values[:, :3].copy(), covariance, np.zeros(0, np.int64)
     )
-    return readings, geodetic
+    return readings, "geodetic" if geodetic else "local"
 
 
 def _with_deviations(kind: TableKind) -> TableKind:

@@ -5,7 +5,6 @@ Source: RTKLIB 2.4.3 manual, appendix B.1 "Positioning solution file", and `outs
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import numpy as np
 
 from icalib.data.tables.table import read_bytes
 from icalib.errors import RecordingError
+from icalib.sensors.position.read.readings import PositionReadings, Recorded, usable_covariances
 from icalib.sensors.position.spec import STATUSES
 
 SUFFIX = ".pos"
@@ -27,24 +27,9 @@ _SIGMAS = {
 _EPOCH_NS = 1_000_000_000
 
 
-@dataclass(frozen=True)
-class PosFile:
-    """stamps_ns (N,) int64: nanoseconds since 1970 in the file's `scale` of time, GPST or UTC, without leap seconds.
-
-    kind: geodetic, earth or local; values (N, 3): latitude, longitude [deg] and height [m], or Earth-centred or local
-    metres; covariance (N, 3, 3) m^2, for geodetic and local in axes east, north and up, or (0, 3, 3); status (N,) index
-    into `STATUSES`, -1: no fix."""
-
-    stamps_ns: np.ndarray
-    scale: str
-    kind: str
-    values: np.ndarray
-    covariance: np.ndarray
-    status: np.ndarray
-
-
-def read_pos(path: Path) -> PosFile:
-    """The solutions in a `.pos` file, which may be gzipped. Raises RecordingError naming file and line."""
+def read_pos(name: str, path: Path) -> tuple[PositionReadings, Recorded]:
+    """The solutions in a `.pos` file, which may be gzipped, and their coordinates. Stamps are in its scale of time,
+    GPST or UTC, from 1970 on without leap seconds. Raises RecordingError naming file and line."""
     lines = read_bytes(path).decode("utf-8", "replace").splitlines()
     header = next((line for line in reversed(lines) if line.startswith("%") and "Q" in line.split()), "")
     names = [name.split("(")[0] for name in header.lstrip("% ").replace(",", " ").split()]
@@ -67,15 +52,14 @@ def read_pos(path: Path) -> PosFile:
     quality = table[:, columns.index("Q")].astype(int)
     index = {q: STATUSES.index(status) for q, status in _STATUS.items()}
     status = np.array([index.get(int(q), -1) for q in quality])
-    return PosFile(
-        np.array(stamps_ns, np.int64), names[0], kind, table[:, :3], _covariance(table, columns, kind), status
-    )
+    covariance = _covariance(table, columns, kind)
+    return PositionReadings(name, np.array(stamps_ns, np.int64), table[:, :3], covariance, status), kind
 
 
-def _kind(path: Path, header: str, names: list[str]) -> str:
-    for kind, first in (("geodetic", "latitude"), ("earth", "x-ecef"), ("local", "e-baseline")):
-        if len(names) > 4 and names[1] == first:
-            return kind
+def _kind(path: Path, header: str, names: list[str]) -> Recorded:
+    kinds: dict[str, Recorded] = {"latitude": "geodetic", "x-ecef": "earth", "e-baseline": "local"}
+    if len(names) > 4 and names[1] in kinds:
+        return kinds[names[1]]
     words = header.strip() or "there is no line that starts with % and names the columns"
     raise RecordingError(
         f"{path}: the header does not name the columns of an RTKLIB solution ({words:.80}); write the file with its "
@@ -123,5 +107,4 @@ def _covariance(table: np.ndarray, columns: list[str], kind: str) -> np.ndarray:
     if kind == "geodetic":  # north, east, up
         a, b, ab, bc, ca = b, a, ab, ca, bc
     rows = np.stack([a, ab, ca, ab, b, bc, ca, bc, c], axis=1).reshape(-1, 3, 3)
-    usable = (np.linalg.eigvalsh(rows)[:, 0] > 0.0) & np.isfinite(rows).all(axis=(1, 2))
-    return rows if usable.all() else np.zeros((0, 3, 3))
+    return usable_covariances(rows, np.ones(len(rows), bool))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from icalib.data.messages import read_odometry_twists, read_twists
+from icalib.data.messages import read_twists
 from icalib.data.recordings.base import Reading, ReadStream, Recording
 from icalib.data.tables.table import TableFile, holds, read_table
 from icalib.data.topics import MessageType, TopicInfo
@@ -58,29 +58,20 @@ def readings(recording: Recording, sensor: Wheels) -> WheelReadings | WheelPoses
 
     Raises RecordingError naming file and line, or topic, where the data are missing or cannot be read.
     """
-    if not recording.has_messages:
-        path = recording.table(sensor, sensor.path)
-        return recording.inside(read_wheel_table(sensor, path, recording.note), path)
-    topic = _topic(recording, sensor)
-    what = f"{recording.place(topic.name)} ({sensor.name})"
-    if topic.kind == "odometry":
-        read = read_wheel_twists(sensor, read_odometry_twists(recording, topic.name), what)
-    elif topic.kind == "twist":
-        read = read_wheel_twists(sensor, read_twists(recording, topic.name), what)
+    topic, what = source(recording, sensor), f"{recording.where(sensor)} ({sensor.name})"
+    if isinstance(topic, Path):
+        return recording.inside(read_wheel_table(sensor, topic, recording.note), topic)
+    if topic.kind in ("odometry", "twist"):
+        read = read_wheel_twists(sensor, read_twists(recording, topic.name, topic.kind), what)
     else:
         read = read_wheel_joints(sensor, read_joints(recording, topic.name), what)
     order = recording.by_stamp(topic.name, read.stamps_ns)
     return WheelReadings(sensor.name, read.stamps_ns[order], read.value[order])
 
 
-def where(recording: Recording, sensor: Wheels) -> str:
-    """Topic or table file of the readings, as text for messages."""
-    if recording.has_messages:
-        return recording.place(_topic(recording, sensor).name)
-    return str(recording.table(sensor, sensor.path))
-
-
-def _topic(recording: Recording, sensor: Wheels) -> TopicInfo:
-    """The topic of the readings: joint states, or twist or odometry if the wheels measure a twist."""
+def source(recording: Recording, sensor: Wheels) -> Path | TopicInfo:
+    """The table, or the topic of the readings: joint states, or twist or odometry if the wheels measure a twist."""
+    if not recording.has_messages:
+        return recording.table(sensor, sensor.path)
     kinds = ("twist", "odometry") if sensor.measures == "twist" else ("joints",)
     return recording.topic(sensor.name, sensor.topic, *kinds)

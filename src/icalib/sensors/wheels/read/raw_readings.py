@@ -16,6 +16,7 @@ from icalib.errors import RecordingError
 from icalib.rig import WheelDrive, WheelMeasure, Wheels
 from icalib.sensors.stream import RawReadings
 from icalib.sensors.wheels.read.joints import JointStream
+from icalib.sensors.wheels.spec import NO_SIDEWAYS
 
 RATE_HZ = (1e-2, 10_000.0)
 STAMPS = TableKind(("t [ns]",), known=(STAMP,), rate_hz=RATE_HZ, more=True)
@@ -28,6 +29,7 @@ UNITS: dict[WheelMeasure, str] = {"rates": "rad/s", "angles": "rad", "ticks": "t
 TWIST = ("v [m/s]", "w [rad/s]")
 _LONGEST_STEP_S = 0.5  # longest time over which a yaw rate is integrated between two messages
 _MOST_PARTIAL = 0.1  # share of messages that lack some joints of the wheels; more are systematic
+_MOST_SIDEWAYS, _ANY_VALUE = 0.2, 1e6  # share of the speed: slip stays below; m/s, rad/s: larger values are invalid
 _ALIGNED, _SCATTERED = 0.9, 0.7  # length of the mean of unit directions: 1 if all are the same
 RELATIVE_POSES = TableKind(
     ("from [ns]", "to [ns]"), ("yaw [rad]", "x [m]", "y [m]", "yaw yaw", "yaw x", "yaw y", "x x", "x y", "y y")
@@ -107,8 +109,20 @@ def read_wheel_twists(wheels: Wheels, twists: TwistStream, what: str) -> WheelRe
             f"same program instead of {wheels.name} (type: pose, kind: relative), or publish linear.x along "
             "the vehicle."
         )
+    if (share := _sideways(twists)) > _MOST_SIDEWAYS:
+        raise RecordingError(f"{what}: linear.y is {share:.0%} of its speed, and {NO_SIDEWAYS}.")
     value = np.stack([twists.linear[:, 0], twists.angular[:, 2]], axis=1)
     return WheelReadings(wheels.name, twists.stamps_ns, value)
+
+
+def _sideways(twists: TwistStream) -> float:
+    """Share of the speed (RMS, at least 0.1 m/s) that is lateral and independent of forward speed and yaw rate, which
+    show a turned or shifted frame."""
+    rows = np.stack([twists.linear[:, 0], twists.angular[:, 2], twists.linear[:, 1]], axis=1)
+    rows = rows[(np.abs(rows) < _ANY_VALUE).all(axis=1)]
+    lateral = rows[:, 2] - rows[:, :2] @ np.linalg.lstsq(rows[:, :2], rows[:, 2], rcond=None)[0]
+    speed = max(float((rows[:, ::2] ** 2).sum()), 0.01 * len(rows), 0.01)
+    return float(np.sqrt(lateral @ lateral / speed))
 
 
 def _in_the_world(twists: TwistStream) -> bool:

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import importlib
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 
@@ -37,16 +36,14 @@ class BagWriter:
         self._topics = topics
         self._connections: dict[str, Any] = {}
 
-    def __enter__(self) -> BagWriter:
+    def __enter__(self) -> Self:
         self._writer.__enter__()
         for topic, kind in self._topics.items():
             self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._writer.__exit__(kind, error, trace)
+    def __exit__(self, *error: Any) -> None:
+        self._writer.__exit__(*error)
 
     def write(self, topic: str, message: Any, received_ns: int) -> None:
         """Writes a message; received_ns: instant of reception on the IMU's clock [ns]."""
