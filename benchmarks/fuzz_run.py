@@ -31,7 +31,7 @@ _ADDRESS_SPACE = 12 << 30  # what asks for more has lost its measure
 _QUOTED = re.compile(r"(?<!\w)'([^'\n]*)'")
 _PLACE = re.compile(r"^icalib: \S+:\d+: [\w.\[\]-]+: ")  # file, line and field
 _NO_NUMBER = re.compile(r"(?<!\w)[-+.]?(nan|inf)(?!\w)", re.IGNORECASE)
-_MADE = ("made", "made.json", "made.yaml", "made.bag", "made.rrd", "made.urdf")
+_MADE = ("made", "made.json", "made.yaml", "made.bag", "made.rig.yaml", "made.rrd", "made.urdf")
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RecordingError, RigError
 from icalib.rig.file import load_rig, rig_to_dict
 from icalib.sensors.camera.read.tracks import read_tracks
@@ -93,3 +94,17 @@ def test_a_camera_without_tracks_needs_a_target(tmp_path):
     path.write_text(RIG.replace("    tracks: cam0/tracks.csv\n", ""))
     with pytest.raises(RigError, match="target is missing; add target, targets .*, or tracks .* of cam0"):
         load_rig(path)
+
+
+def test_a_folder_of_readings_and_tracks_alone_is_read(tmp_path):
+    """Nothing of it names corners or images, which have even stamps, too."""
+    stamps = 10**9 + 5_000_000 * np.arange(200)
+    for name in ("imu0", "cam0"):
+        (tmp_path / name).mkdir()
+    readings = "".join(f"{t},0.1,{0.01 * (k % 7)},0.3,0,{0.1 * (k % 3)},9.81\n" for k, t in enumerate(stamps))
+    (tmp_path / "imu0" / "data.csv").write_text("#t [ns],wx,wy,wz,ax,ay,az\n" + readings)
+    rows = "".join(f"{t},7,{10.0 + k},20\n" for k, t in enumerate(stamps[::10]))
+    (tmp_path / "cam0" / "tracks.csv").write_text("#t [ns],feature,u [px],v [px]\n" + rows)
+    (tmp_path / "rig.yaml").write_text(RIG.replace("{type: imu}", "{type: imu, noise: consumer}"))
+    (stream,) = read_measurements(open_recording(tmp_path), load_rig(tmp_path / "rig.yaml")).tracks
+    assert stream.stamps_ns.tolist() == stamps[::10].tolist()

@@ -71,7 +71,10 @@ def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> l
 
 
 def source(recording: Recording, camera: Camera) -> str:
-    """Text that names the source of the camera's corners in messages: its table, or its image topic."""
+    """Text that names the source of the camera's corners in messages: its table, or its image topic. Without corners
+    and images, that of its tracks."""
+    if camera.tracks is not None and not sees(recording, camera):
+        return str(recording.table(camera, camera.tracks, "tracks"))
     if has_corners(recording, camera):
         return str(recording.table(camera, camera.path))
     return recording.place(image_topic(recording, camera))
