@@ -1,4 +1,4 @@
-"""Vehicles that drive straight most of the time, or turn in place: what their sensors hardly show is no contradiction."""
+"""Vehicles that drive straight most of the time, or turn in place, contradict no sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from icalib.sensors.imu.spec import class_noise
 
 
 def test_the_heading_of_two_antennas_on_a_straight_drive():
-    """Three turns of 2 s in 60 s. Between them the rates of the heading are noise, which does not change their scale."""
+    """Three turns of 2 s in 60 s. Between them the rates of the heading are noise."""
     seconds = np.arange(0.0, 60.0, 0.01)
 
     def yaw_rate(t: np.ndarray) -> np.ndarray:
