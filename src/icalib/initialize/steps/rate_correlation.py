@@ -185,10 +185,9 @@ MAX_EQUAL_RATIO = 1.5  # misfits that differ by less are equal: a route that rep
 def closest_of_equals(fits: Iterable[tuple[float, float, F]], same_clock: float, floor: float) -> F | None:
     """The best of `fits`, each a misfit, a time offset [s] and a result. Among misfits that are equal, or below
     `floor`, the offset closest to `same_clock` wins: that of stamps by one clock. None without fits."""
-    every = list(fits)
-    most = MAX_EQUAL_RATIO * max(floor, min((misfit for misfit, _, _ in every), default=0.0))
-    equal = [(abs(offset - same_clock), fit) for misfit, offset, fit in every if misfit <= most]
-    return min(equal, key=lambda x: x[0])[1] if equal else None
+    ranked = sorted(fits, key=lambda fit: fit[0])
+    equal = [fit for fit in ranked if fit[0] <= MAX_EQUAL_RATIO * max(floor, ranked[0][0])]
+    return min(equal, key=lambda fit: abs(fit[1] - same_clock))[2] if equal else None
 
 
 MaskedSignal = tuple[np.ndarray, np.ndarray]  # values, and bool: which of them are known

@@ -41,7 +41,6 @@ ACCEL_BIAS_SIGMA_M_S2 = 0.3  # m/s^2
 ARM_SIGMA_M = 2.0  # m, of a car's antenna
 OFFSET_SIGMA_S = 0.3  # s, about a peak of the correlation
 ROTATION_SIGMA_RAD = 10.0  # rad: no prior
-MAD_TO_SIGMA = 1.4826  # ratio of the standard deviation of normal noise to its median absolute value
 N_YAWS = 24  # candidates of the first attitude
 MIN_TRIPLE_SIGMA_M_S = 0.05  # m/s, of a second difference of fixes with 2 cm of noise, 1 s apart
 
@@ -65,31 +64,26 @@ class Fix:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of a fix [m], root of the sum over the axes, by the median absolute fourth differences,
-        which contain little motion."""
-        fourth = np.diff(self.position, n=4, axis=0)
-        sigma = MAD_TO_SIGMA / np.sqrt(70.0) * np.median(np.abs(fourth), axis=0)  # 70: sum of squared binomials
-        return float(np.linalg.norm(sigma))
+        which contain little motion. 70 is the sum of their squared binomials, 1.48 the ratio of sigma to the median."""
+        fourth = np.abs(np.diff(self.position, n=4, axis=0))
+        return float(np.linalg.norm(1.4826 / np.sqrt(70.0) * np.median(fourth, axis=0)))
 
     @cached_property
     def triples(self) -> Triples:
         """Triples of fixes without a step of the solution between them. They are as far apart as their noise demands:
         velocities change more in a longer time, and noise changes them less."""
-        triples, step = self._triples(TRIPLE_STEP_S), TRIPLE_STEP_S
-        while len(triples.i) and step < MAX_TRIPLE_STEP_S and self.noise_share(triples) > MAX_TRIPLE_NOISE:
-            step, shorter = 2.0 * step, triples
-            triples = self._triples(step)
-            if len(triples.i) < MIN_WINDOW_TRIPLES:
-                return shorter
-        return triples
+        found: list[Triples] = []
+        for step in TRIPLE_STEPS_S:
+            triples = triples_of(self.t, step)
+            found.append(triples.some(self.run[triples.i] == self.run[triples.k]))
+            if len(found[-1].i) < MIN_WINDOW_TRIPLES or self.noise_share(found[-1]) < MAX_TRIPLE_NOISE:
+                break
+        return next((x for x in reversed(found) if len(x.i) >= MIN_WINDOW_TRIPLES), found[0])
 
     def noise_share(self, triples: Triples) -> float:
         """RMS of the noise in second differences over `triples`, over their RMS."""
         size = np.sqrt((triples.second(self.position) ** 2).sum(axis=1).mean())
         return float(np.sqrt(6.0) * self.noise / np.median(triples.half) / max(size, 1e-9))
-
-    def _triples(self, step: float) -> Triples:
-        triples = triples_of(self.t, step)
-        return triples.some(self.run[triples.i] == self.run[triples.k])
 
 
 @dataclass(frozen=True)
@@ -242,9 +236,9 @@ def span_of(t: np.ndarray, triples: Triples) -> tuple[float, float]:
 
 
 # s, between the fixes of a triple. A second difference has 5 cm/s by noise of 2 cm, and about 1 m/s by the motion of a
-# walk or a car. A gyroscope drifts by less than a degree meanwhile.
-TRIPLE_STEP_S = 1.0
-MAX_TRIPLE_STEP_S, MAX_TRIPLE_NOISE = 4.0, 0.25  # s; noise over size of second differences that widens the step
+# walk or a car. A gyroscope drifts by less than a degree meanwhile. Longer ones are for more noise or a slower motion.
+TRIPLE_STEPS_S = 1.0, 2.0, 4.0
+MAX_TRIPLE_NOISE = 0.25  # noise over size of second differences: with more, the next step is taken
 MAX_TRIPLE_STEPS = 1.6  # times the step, or that of slower fixes: beyond it there is a gap
 WINDOW_MARGIN_S = 0.2  # s of readings on both sides of the fixes of a window, as the time offset changes in the fit
 

@@ -47,7 +47,7 @@ NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2 
 KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S = 1e-3, 0.01  # a clock that drifts by 20 ppm has 10 ms in 500 s
 MIN_ACCELERATION_M_S2 = 0.02  # RMS over a second: accelerometer biases vary by as much
 MAX_NOISE_SHARE = 0.5  # of the change of acceleration that the IMU shows: more noise hides the lever arm
-MIN_ACCELERATION_NOISE_RATIO = 1.5  # RMS acceleration of fixes over what their noise makes of it: less is no motion
+MAX_EVEN_NOISE = 0.7  # noise over size of second differences: with more, the fixes show no motion
 VELOCITY_STEP_S = 0.25  # of central differences: noise of 2 cm makes 6 cm/s
 
 
@@ -162,10 +162,8 @@ def _check_acceleration(imu: ImuData, name: str, fix: Fix) -> None:
             f"acceleration by {by_noise:.2g} m/s^2 in a second, and the motion changes it by {felt:.2g}. Use fixes of "
             "less noise (RTK), or add wheels or an odometry, which show the motion."
         )
-    acceleration = fix.triples.second(fix.position) / fix.triples.half[:, None]
-    rms = float(np.sqrt(np.median((acceleration**2).sum(axis=1))))
-    by_noise = np.sqrt(6.0) * fix.noise / float(np.median(fix.triples.half)) ** 2
-    if rms < max(MIN_ACCELERATION_M_S2, MIN_ACCELERATION_NOISE_RATIO * by_noise):
+    rms = np.sqrt(((fix.triples.second(fix.position) / fix.triples.half[:, None]) ** 2).sum(axis=1).mean())
+    if rms < MIN_ACCELERATION_M_S2 or fix.noise_share(fix.triples) > MAX_EVEN_NOISE:
         raise EstimationError(
             f"{name}: its fixes are motionless or move evenly (accelerations of {rms:.2g} m/s^2, no more than noise); "
             "record again while speeding up, braking and turning."

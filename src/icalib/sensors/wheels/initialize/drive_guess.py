@@ -317,20 +317,19 @@ def _check_lateral_slip(name: str, slip: np.ndarray, motion: np.ndarray, forward
     slip (n,) [m/s]: lateral speed for the best axis; motion (n, 3): velocity [m/s] and yaw rate [rad/s]; forwards (n,):
     rate that the wheels measure. If the motion explains it, the vehicle moves sideways; else MotionContradictedError.
     """
-    share = float(np.sqrt(np.mean(slip**2) / np.mean((motion[:, :2] ** 2).sum(axis=1))))
+    share = np.linalg.norm(slip) / np.linalg.norm(motion[:, :2])
     if share <= MAX_LATERAL_SLIP:
         return
     left = forwards - motion @ _robust_fit(motion, forwards)
-    if np.sqrt(np.mean(left**2)) < MAX_LATERAL_SLIP * np.sqrt(np.mean(forwards**2)):
+    if np.linalg.norm(left) < MAX_LATERAL_SLIP * np.linalg.norm(forwards):
         raise EstimationError(
             f"{name}: its speed fits the motion along one axis, but the vehicle moves sideways as well, by "
             f"{share:.0%} of its speed. Drives with mecanum or omni wheels are not supported; give its odometry as a "
             "sensor of type: pose with kind: relative."
         )
     raise MotionContradictedError(
-        f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % "
-        "of its speed; check that the sensor that shows its motion is on this vehicle, and how its poses "
-        "are written."
+        f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % of its "
+        "speed; check that the sensor that shows its motion is on this vehicle, and how its poses are written."
     )
 
 
