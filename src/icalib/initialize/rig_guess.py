@@ -102,12 +102,11 @@ def _on_assumed_motion(
     others = [m.without(imu.name) for m in recordings]
     try:
         assumed, state, _ = guess_with_assumed_motion(inputs.rig.without(imu.name), others)
-        posed = []
-        for m, k, part in zip(others, state.recordings, assumed.parts, strict=True):
-            stamps = m.origin_ns + np.round(1e9 * (state.seconds[k] - part.begin)).astype(np.int64)
-            posed.append(PoseStream(ASSUMED_POSES, stamps, state.rotation[k], state.position[k]))
-        rig = inputs.rig.only(imu.name).with_sensors(pose_sensor_for(ASSUMED_POSES))
-        posed = [m.only(imu.name).with_streams(s) for m, s in zip(recordings, posed, strict=True)]
+        posed, rig = [], inputs.rig.only(imu.name).with_sensors(pose_sensor_for(ASSUMED_POSES))
+        for m, without, k, part in zip(recordings, others, state.recordings, assumed.parts, strict=True):
+            stamps = without.origin_ns + np.round(1e9 * (state.seconds[k] - part.begin)).astype(np.int64)
+            poses = PoseStream(ASSUMED_POSES, stamps, state.rotation[k], state.position[k])
+            posed.append(m.only(imu.name).with_streams(poses))
         source_inputs, source = inputs_for(rig, posed, inputs), motion_kinds(rig)[0]
         return source, source_inputs, source.trajectory(source_inputs, lambda: (source_inputs, state))
     except EstimationError:

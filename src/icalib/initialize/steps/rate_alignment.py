@@ -36,7 +36,6 @@ MAX_UNEXPLAINED_RATIO_OF_OTHER = 0.5  # unexplained rate at another offset over 
 MIN_COMMON_RATE_SHARE = 0.3  # projection over norm of the sensor's rate: below, a ratio of rates says nothing
 STILL_RATE_RAD_S = 0.03  # rad/s: slower rotation is not distinguished from rest
 MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the gyroscope's noise, below which means are compared instead
-_SAME_RECORDING = "check that both come from the same recording and overlap in time"
 MIN_SECOND_AXIS_RATIO = 0.05  # spread of rates along the second axis over that along the first
 MAX_ALIGNMENT_ITERATIONS = 12  # of Gauss-Newton and Kabsch in turns, at most
 DEG_PER_RAD = 180.0 / np.pi  # ratio of rates in deg/s to rates in rad/s
@@ -134,7 +133,11 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
     """Raises EstimationError if too much of the rate is unexplained. given: whether the rig file gives the offset."""
     if unexplained > MAX_UNEXPLAINED_RATE:
         where = "with the time_offset in the rig file" if given else "at any time offset"
-        advice = "correct it, or remove it so that it is estimated" if given else _SAME_RECORDING
+        advice = (
+            "correct it, or remove it so that it is estimated"
+            if given
+            else "check that both come from the same recording and overlap in time"
+        )
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} {where} ({unexplained:.0%} of the angular rate is "
             f"unexplained); {advice}."

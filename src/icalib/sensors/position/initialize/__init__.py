@@ -270,8 +270,7 @@ def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> 
     third differences with the IMU's readings. Speeds differ where the rig turns on the spot, by the lever arm."""
     if known.offset is not None:
         return [known.offset]
-    peaks = [shift.samples / SIGNAL_RATE_HZ for shift in likely_offsets(motion.imu, fix)]
-    by_acceleration = [fix.same_clock, *peaks]
+    by_acceleration = [fix.same_clock, *(x.samples / SIGNAL_RATE_HZ for x in likely_offsets(motion.imu, fix))]
     state = motion.state
     motion_speeds = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
     fix_speeds = _speeds(fix.t, fix.position, fix.run)

@@ -64,9 +64,9 @@ class Fix:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of a fix [m], root of the sum over the axes, by the median absolute fourth differences,
-        which contain little motion. 70 is the sum of their squared binomials, 1.48 the ratio of sigma to the median."""
+        which contain little motion; at least 1 mm. 70: sum of squared binomials; 1.48: ratio of sigma to the median."""
         fourth = np.abs(np.diff(self.position, n=4, axis=0))
-        return float(np.linalg.norm(1.4826 / np.sqrt(70.0) * np.median(fourth, axis=0)))
+        return max(1e-3, float(np.linalg.norm(1.4826 / np.sqrt(70.0) * np.median(fourth, axis=0))))
 
     @cached_property
     def triples(self) -> Triples:

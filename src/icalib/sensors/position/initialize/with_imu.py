@@ -45,7 +45,6 @@ MAX_OFFSETS_TRIED = 4  # candidates, by correlation
 # Standard deviations between neighbouring windows: gyroscope drift over a window, and changes of biases.
 NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2 = 0.1, 5e-3, 0.1
 KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S = 1e-3, 0.01  # a clock that drifts by 20 ppm has 10 ms in 500 s
-MIN_ACCELERATION_M_S2 = 0.02  # RMS over a second: accelerometer biases vary by as much
 MAX_NOISE_SHARE = 0.5  # of the change of acceleration that the IMU shows: more noise hides the lever arm
 MAX_EVEN_NOISE = 0.7  # noise over size of second differences: with more, the fixes show no motion
 VELOCITY_STEP_S = 0.25  # of central differences: noise of 2 cm makes 6 cm/s
@@ -118,30 +117,13 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
             "recording, or the time_offset in the rig file."
         )
     best, window = closest
-    most = np.hypot(MAX_ACCELERATION_MISFIT, min(fix.noise_share(triples), MAX_TRIPLE_NOISE))
-    if best.misfit > most:
-        _check_acceleration(imu, name, fix)
     if best.misfit > SUSPICIOUS_MISFIT:
         other = replace(fix, position=fix.position[:, [1, 0, 2]])
         tried = [one for x in offsets if (one := _fit_at_offset(imu, other, triples, x, gravity, known)) is not None]
         mirrored = min((one[0].misfit for one in tried), default=np.inf) < MIRRORED_RATIO * best.misfit
-        if mirrored or best.misfit > most:
-            raise _contradicting(imu, name, best.misfit, mirrored)
+        _check_misfit(imu, name, fix, best.misfit, mirrored)
     usable = recorded(imu, triples, fix.t + best.at.offset)
     return PositionMotion(imu, fix, best, _all_windows(imu, fix, usable, (best, window), gravity))
-
-
-def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> EstimationError:
-    sentence = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
-    if mirrored:
-        return EstimationError(
-            f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
-            "of x and y, by `columns: [...]` in the rig file."
-        )
-    return OtherMotionError(
-        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
-        "(accel_unit, gyro_unit)."
-    )
 
 
 def _candidate_offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[float]:
@@ -152,22 +134,34 @@ def _candidate_offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[f
     return [*likely[:MAX_OFFSETS_TRIED], fix.same_clock]
 
 
-def _check_acceleration(imu: ImuData, name: str, fix: Fix) -> None:
-    """Raises EstimationError if the acceleration of the fixes is no more than noise. Third differences over a second,
-    of the IMU, show how much it changes."""
+def _check_misfit(imu: ImuData, name: str, fix: Fix, misfit: float, mirrored: bool) -> None:
+    """Raises EstimationError if fixes and readings contradict each other, or the acceleration is no more than noise.
+    Third differences over a second, of the IMU, show how much it changes."""
+    sentence = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
+    if mirrored:
+        raise EstimationError(
+            f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
+            "of x and y, by `columns: [...]` in the rig file."
+        )
+    share = fix.noise_share(fix.triples)
+    if misfit <= np.hypot(MAX_ACCELERATION_MISFIT, min(share, MAX_TRIPLE_NOISE)):
+        return
     felt, by_noise, rate = change_of_acceleration(imu), np.sqrt(20.0) * fix.noise, 1.0 / np.median(np.diff(fix.t))
     if by_noise > MAX_NOISE_SHARE * felt:
         raise EstimationError(
             f"{name}: its fixes are too noisy for {imu.name} alone: {fix.noise:.2g} m at {rate:.2g} Hz change the "
             f"acceleration by {by_noise:.2g} m/s^2 in a second, and the motion changes it by {felt:.2g}. Use fixes of "
-            "less noise (RTK), or add wheels or an odometry, which show the motion."
+            "less noise (RTK), move faster, or add wheels or an odometry, which show the motion."
         )
-    rms = np.sqrt(((fix.triples.second(fix.position) / fix.triples.half[:, None]) ** 2).sum(axis=1).mean())
-    if rms < MIN_ACCELERATION_M_S2 or fix.noise_share(fix.triples) > MAX_EVEN_NOISE:
+    if share > MAX_EVEN_NOISE:
         raise EstimationError(
-            f"{name}: its fixes are motionless or move evenly (accelerations of {rms:.2g} m/s^2, no more than noise); "
-            "record again while speeding up, braking and turning."
+            f"{name}: its fixes are motionless or move evenly, beside noise of {fix.noise:.2g} m; record again while "
+            "speeding up, braking and turning."
         )
+    raise OtherMotionError(
+        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
+        "(accel_unit, gyro_unit)."
+    )
 
 
 def _fit_at_offset(
