@@ -19,7 +19,8 @@ def test_the_heading_of_two_antennas_on_a_straight_drive():
     seconds = np.arange(0.0, 60.0, 0.01)
 
     def yaw_rate(t: np.ndarray) -> np.ndarray:
-        return sum(a * np.exp(-(((t - c) / 0.8) ** 2)) for a, c in ((1.3, 12.0), (-1.2, 31.0), (1.1, 52.0)))
+        turns = [a * np.exp(-(((t - c) / 0.8) ** 2)) for a, c in ((1.3, 12.0), (-1.2, 31.0), (1.1, 52.0))]
+        return np.sum(turns, axis=0)
 
     rng = np.random.default_rng(0)
     gyro = np.outer(yaw_rate(seconds), [0.0, 0.0, 1.0]) + 1e-3 * rng.normal(size=(len(seconds), 3))

@@ -72,13 +72,13 @@ class Fix:
     def triples(self) -> Triples:
         """Triples of fixes without a step of the solution between them. They are as far apart as their noise demands:
         velocities change more in a longer time, and noise changes them less."""
-        found: list[Triples] = []
+        candidates: list[Triples] = []
         for step in TRIPLE_STEPS_S:
             triples = triples_of(self.t, step)
-            found.append(triples.some(self.run[triples.i] == self.run[triples.k]))
-            if len(found[-1].i) < MIN_WINDOW_TRIPLES or self.noise_share(found[-1]) < MAX_TRIPLE_NOISE:
+            candidates.append(triples.some(self.run[triples.i] == self.run[triples.k]))
+            if len(candidates[-1].i) < MIN_WINDOW_TRIPLES or self.noise_share(candidates[-1]) < MAX_TRIPLE_NOISE:
                 break
-        return next((x for x in reversed(found) if len(x.i) >= MIN_WINDOW_TRIPLES), found[0])
+        return next((x for x in reversed(candidates) if len(x.i) >= MIN_WINDOW_TRIPLES), candidates[0])
 
     def noise_share(self, triples: Triples) -> float:
         """RMS of the noise in second differences over `triples`, over their RMS."""
