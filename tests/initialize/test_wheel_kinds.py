@@ -102,3 +102,12 @@ def test_what_turns_the_other_way_round_is_named(kind, values, words):
 def test_a_vehicle_that_stood_still_is_named(kind, values):
     with pytest.raises(EstimationError, match="wheel0: the vehicle stood still according to its readings"):
         rates_at(kind, values * ([0.0, 0.0] if kind == "twist" else [0.0, 1.0, 1.0, 0.0]), 0.0)
+
+
+def test_mecanum_wheels_move_sideways():
+    """The speed ahead is that of the motion; of another vehicle it is not."""
+    sideways = np.outer(0.9 * np.sin(1.3 * T), R_IMU_WHEEL[:, 1])
+    with pytest.raises(EstimationError, match="moves sideways as well, by .*mecanum or omni.*kind: relative"):
+        drive_guess("wheel0", TWIST, RATE, VELOCITY + sideways, UP, "twist")
+    with pytest.raises(EstimationError, match="drives along none of its axes"):
+        drive_guess("wheel0", TWIST[::-1], RATE, VELOCITY + sideways, UP, "twist")

@@ -12,6 +12,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
+from icalib.initialize.steps.rate_correlation import closest_of_equals
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 from icalib.motion.sweep import EstimatedMotion
@@ -70,6 +71,48 @@ def test_everything_from_fixes_and_readings(world):
     np.testing.assert_allclose(p @ yaw(FRAME_YAW).T + ORIGIN, p_true, atol=0.5)
     assert np.median(np.abs(v @ yaw(FRAME_YAW).T - v_true)) < 0.15
     assert bias.shape == (len(t), 6)
+
+
+@pytest.mark.parametrize("noise", [0.02, 0.4])
+def test_a_robot_that_turns_on_the_spot(noise):
+    """The antenna moves by its lever arm alone, in whichever direction: the heading of the frame is not known."""
+    T_imu_sensor = np.eye(4)
+    T_imu_sensor[:3, 3] = ARM
+    gnss = SimPositions("gnss0", T_imu_sensor, time_offset_s=0.3, position_noise=noise)
+    made = Scenario(
+        (), duration_s=40.0, motion=Drive("spin"), board=False, room=Room((30.0, 20.0, 6.0)), sensors=(gnss,)
+    )
+    sim = simulate(made, 1)
+    imu = ImuData.build(not_none(sim.measurements.imu), made.imu_noise)
+    (stream,) = sim.measurements.of(PositionStream)
+    same_clock = 1e-9 * (stream.origin_ns - not_none(sim.measurements.imu).origin_ns)
+    fix = Fix(stream.seconds, stream.position, same_clock)
+    if noise > 0.1:
+        with pytest.raises(EstimationError, match=r"too noisy for imu0 alone: 0\.\d+ m at 5 Hz .* (wheels|odometry)"):
+            motion_from_fixes(imu, "gnss0", fix, GRAVITY, KnownExtrinsics())
+        return
+    best = motion_from_fixes(imu, "gnss0", fix, GRAVITY, KnownExtrinsics()).best.at
+    offset = float(sim.truth.reported["gnss0"].seconds[0] - sim.truth.seconds[0])
+    assert best.offset == pytest.approx(offset, abs=0.03)
+    assert np.linalg.norm(best.arm[:2]) == pytest.approx(np.linalg.norm(ARM[:2]), abs=0.05)
+
+
+def test_noise_is_averaged_over_longer_triples():
+    """0.4 m of noise makes 1 m/s^2 over a second, more than the robot reaches."""
+    sim = recording("planar", 1)
+    (stream,) = sim.measurements.of(PositionStream)
+    imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
+    noise = 0.4 * np.random.default_rng(0).normal(size=stream.position.shape)
+    fix = Fix(stream.seconds, stream.position + noise)
+    assert np.median(fix.triples.half) > 3.0
+    best = motion_from_fixes(imu, "gnss0", fix, GRAVITY, KnownExtrinsics()).best.at
+    np.testing.assert_allclose(best.arm[:2], ARM[:2], atol=0.5)
+
+
+def test_the_offset_of_one_clock_wins_among_equals():
+    fits = [(0.0130, -29.96, "a period early"), (0.0137, 0.04, "one clock"), (0.5, 0.0, "no fit")]
+    assert closest_of_equals(fits, 0.0, 0.01) == "one clock"
+    assert closest_of_equals([], 0.0, 0.01) is None
 
 
 def test_what_is_known_stays(world):

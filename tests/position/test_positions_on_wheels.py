@@ -136,3 +136,16 @@ def test_fixes_of_another_drive():
     (fixes,) = other.measurements.of(PositionStream)
     with pytest.raises(EstimationError, match="wheels0: its speeds and turns do not match those of the positions"):
         calibrate_measurements(rig_without_imu(sim), sim.measurements.without("imu0").with_streams(fixes))
+
+
+def test_an_imu_does_not_make_it_fail(monkeypatch):
+    """Without a guess by the fixes and the IMU, the first guess is the motion by wheels and fixes."""
+
+    def refused(*_):
+        raise EstimationError("its fixes are too noisy")
+
+    monkeypatch.setattr("icalib.sensors.position.initialize.motion_from_fixes", refused)
+    sim = driven(1, 40.0)
+    result = calibrate_measurements(rig_for(sim.scenario), sim.measurements)
+    np.testing.assert_allclose(result.value("gnss0", "translation")[:2], ARM[:2], atol=0.03)
+    np.testing.assert_allclose(result.value("wheels0", "radii"), sim.truth.values["wheels0"]["radii"], rtol=0.005)

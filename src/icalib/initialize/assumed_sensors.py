@@ -10,7 +10,8 @@ from icalib.data.measurements import ImuStream, Measurements, PoseStream
 from icalib.initialize.steps.smooth_trajectory import BodyPoses, SmoothTrajectory
 from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseSensor
 
-ASSUMED_IMU = "assumed motion"  # name of the assumed IMU; it has a space, so no sensor has this name
+# Names of the assumed IMU, and of the pose sensor that stands for motion without the IMU. No sensor has a space in it.
+ASSUMED_IMU, ASSUMED_POSES = "assumed motion", "assumed poses"
 # s: ratio of the assumed IMU's white noise density to its random walk density; keeps covariances regular
 REGULARISING_STEP_S = 5e-3
 

@@ -6,11 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from icalib.data.measurements import Measurements
+import numpy as np
+
+from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, resample, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.initialize.assumed_motion import guess_with_assumed_motion
+from icalib.initialize.assumed_sensors import ASSUMED_POSES, pose_sensor_for
 from icalib.initialize.recording_times import naming_recording_times
 from icalib.initialize.steps.initializer import (
     InitialGuess,
@@ -81,10 +84,33 @@ def _trajectory(
 
     try:
         return kind, source_inputs, kind.trajectory(source_inputs, fallback)
-    except EstimationError:
-        if source_inputs.rig.has_target or not fallbacks:
+    except EstimationError as error:
+        if source_inputs.rig.has_target or not (fallbacks or inputs.rig.wheels):
             raise
+        if not fallbacks:
+            return _on_assumed_motion(inputs, recordings, error)
     return _trajectory(inputs, recordings, fallbacks)
+
+
+def _on_assumed_motion(
+    inputs: Inputs, recordings: Sequence[Measurements], failed: EstimationError
+) -> tuple[Initializer[Any], Inputs, State]:
+    """As `_trajectory`, from the motion that the other sensors show without the IMU, such as wheels and fixes. A pose
+    sensor stands for it. Raises `failed` if they do not show it either."""
+    imu = inputs.rig.imu
+    assert imu is not None
+    others = [m.without(imu.name) for m in recordings]
+    try:
+        assumed, state, _ = guess_with_assumed_motion(inputs.rig.without(imu.name), others)
+        posed, rig = [], inputs.rig.only(imu.name).with_sensors(pose_sensor_for(ASSUMED_POSES))
+        for m, without, k, part in zip(recordings, others, state.recordings, assumed.parts, strict=True):
+            stamps = without.origin_ns + np.round(1e9 * (state.seconds[k] - part.begin)).astype(np.int64)
+            poses = PoseStream(ASSUMED_POSES, stamps, state.rotation[k], state.position[k])
+            posed.append(m.only(imu.name).with_streams(poses))
+        source_inputs, source = inputs_for(rig, posed, inputs), motion_kinds(rig)[0]
+        return source, source_inputs, source.trajectory(source_inputs, lambda: (source_inputs, state))
+    except EstimationError:
+        raise failed from None
 
 
 def _align_to_trajectory(

@@ -43,10 +43,11 @@ BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = rang
 
 
 class Fixes(NamedTuple):
-    """t (n,) s since the first stamp of the sensor, z (n,) complex: x + i y of its positions [m]."""
+    """t (n,) s since the first stamp of the sensor, `origin_ns`; z (n,) complex: x + i y of its positions [m]."""
 
     t: np.ndarray
     z: np.ndarray
+    origin_ns: int = 0
 
 
 class OtherMotionError(EstimationError):

@@ -29,13 +29,13 @@ from icalib.motion.axes import other_axes
 from icalib.motion.imu_data import ImuData
 
 MAX_UNEXPLAINED_RATE = 0.35  # unexplained share of the angular rate above which the motions differ
+MIN_TURN_RATIO = 0.3  # rate over its RMS, below which a vehicle that drives straight most of the time does not turn
 LONG_RATE_MEAN_S = 0.5  # s: duration of the means that are compared if those over RATE_MEAN_S do not match
 OFFSET_AGREEMENT_S = 0.01  # s: time offsets that differ by less agree
 MAX_UNEXPLAINED_RATIO_OF_OTHER = 0.5  # unexplained rate at another offset over that at the present one, to replace it
 MIN_COMMON_RATE_SHARE = 0.3  # projection over norm of the sensor's rate: below, a ratio of rates says nothing
 STILL_RATE_RAD_S = 0.03  # rad/s: slower rotation is not distinguished from rest
 MAX_NOISE_RATIO_AT_REST = 1.5  # RMS of the rate over the gyroscope's noise, below which means are compared instead
-_SAME_RECORDING = "check that both come from the same recording, overlap in time, and are in rad/s"
 MIN_SECOND_AXIS_RATIO = 0.05  # spread of rates along the second axis over that along the first
 MAX_ALIGNMENT_ITERATIONS = 12  # of Gauss-Newton and Kabsch in turns, at most
 DEG_PER_RAD = 180.0 / np.pi  # ratio of rates in deg/s to rates in rad/s
@@ -133,7 +133,11 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
     """Raises EstimationError if too much of the rate is unexplained. given: whether the rig file gives the offset."""
     if unexplained > MAX_UNEXPLAINED_RATE:
         where = "with the time_offset in the rig file" if given else "at any time offset"
-        advice = "correct it, or remove it so that it is estimated" if given else _SAME_RECORDING
+        advice = (
+            "correct it, or remove it so that it is estimated"
+            if given
+            else "check that both come from the same recording and overlap in time"
+        )
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} {where} ({unexplained:.0%} of the angular rate is "
             f"unexplained); {advice}."
@@ -141,13 +145,16 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
 
 
 def _unexplained(imu: ImuData, rates: SensorRates, alignment: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
-    """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. The
-    known noise of the sensor's rates is subtracted."""
+    """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. Means of
+    a slow rotation are left out, because they show noise: a vehicle drives straight most of the time. The known noise
+    of the sensor's rates is subtracted."""
     gyro, sensor = _side_by_side(imu, rates, alignment.offset, averaged)
     gyro, sensor = gyro - alignment.gyro_bias, sensor @ alignment.rotation.T
-    unexplained = float(np.median(np.linalg.norm(gyro - sensor, axis=1)))
+    size = np.linalg.norm(gyro, axis=1)
+    turning = size >= MIN_TURN_RATIO * np.sqrt((size**2).mean())
+    unexplained = float(np.median(np.linalg.norm(gyro - sensor, axis=1)[turning]))
     unexplained = np.sqrt(max(unexplained**2 - (MEDIAN_NORM * rate_difference_noise(imu, rates, averaged)) ** 2, 0.0))
-    return float(unexplained / np.median(np.linalg.norm(gyro, axis=1)))
+    return float(unexplained / np.median(size[turning]))
 
 
 def _unexplained_at(imu: ImuData, rates: SensorRates, alignment: RateAlignment, offset: float) -> float:
@@ -375,10 +382,11 @@ def _check_scale(imu: ImuData, name: str, rates: SensorRates, alignment: RateAli
 
 def _rate_ratio(alignment: RateAlignment, gyro: np.ndarray, camera: np.ndarray) -> float:
     """Rate of the gyroscope over that of the sensor, both (n, 3) about their medians, which hold the bias. The sensor's
-    rate is projected on the gyroscope's, so that its noise averages out. 1 if the rates do not correlate."""
+    rate is projected on the gyroscope's, so that its noise averages out, where that is faster than its RMS, see
+    `_unexplained`. 1 if the rates do not correlate."""
     gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ alignment.rotation.T
     size = np.linalg.norm(gyro, axis=1)
-    fast = size > np.median(size)
+    fast = size >= np.sqrt((size**2).mean())
     along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])
     alike = along > MIN_COMMON_RATE_SHARE * np.median(np.linalg.norm(camera[fast], axis=1))
     return float(np.median(size[fast]) / along) if alike else 1.0

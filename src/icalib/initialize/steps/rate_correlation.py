@@ -6,8 +6,9 @@ Processing, 2012).
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -76,8 +77,8 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any time offset "
-            f"({correlation_in_words(peaks[0].largest)}); check that both come from the same recording, overlap in "
-            "time, and are in rad/s."
+            f"({correlation_in_words(peaks[0].largest)}); check that both come from the same recording and overlap "
+            "in time."
         )
     return [p.samples / CORRELATION_GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
 
@@ -103,7 +104,7 @@ def _offsets_of_slow_rates(imu: ImuData, name: str, rates: SensorRates) -> list[
         raise EstimationError(
             f"the rotation of {name}, {MAX_USUAL_STEPS / rates.longest_step_s:.2g} poses per second, does not "
             f"match that of {imu.name} at any time offset ({misfit}). Check that both come from the same "
-            "recording, overlap in time, and are in rad/s, or record at a higher rate."
+            "recording and overlap in time, or record at a higher rate."
         )
     return alike
 
@@ -175,6 +176,18 @@ def moving_means(values: np.ndarray, count: int) -> np.ndarray:
 def interpolated(t: np.ndarray, values: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """(n, 3) values at `seconds` (n,), by linear interpolation of values (N, 3) at `t` (N,) s."""
     return np.stack([np.interp(seconds, t, values[:, k]) for k in range(3)], axis=1)
+
+
+F = TypeVar("F")
+MAX_EQUAL_RATIO = 1.5  # misfits that differ by less are equal: a route that repeats itself fits at several offsets
+
+
+def closest_of_equals(fits: Iterable[tuple[float, float, F]], same_clock: float, floor: float) -> F | None:
+    """The best of `fits`, each a misfit, a time offset [s] and a result. Among misfits that are equal, or below
+    `floor`, the offset closest to `same_clock` wins: that of stamps by one clock. None without fits."""
+    ranked = sorted(fits, key=lambda fit: fit[0])
+    equal = [fit for fit in ranked if fit[0] <= MAX_EQUAL_RATIO * max(floor, ranked[0][0])]
+    return min(equal, key=lambda fit: abs(fit[1] - same_clock))[2] if equal else None
 
 
 MaskedSignal = tuple[np.ndarray, np.ndarray]  # values, and bool: which of them are known

@@ -164,10 +164,12 @@ def solve_lever_arm(
 
 
 def unexplained_displacement(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> float:
-    """Median residual of the solution R_is, x (m,) over the median part of the sensor's trajectory in the equations."""
+    """Median residual of the solution R_is, x (m,) over the median motion of the IMU in the equations. The motion of
+    the sensor is no measure: inverted poses of a robot that turns in place move far, and any lever arm explains it."""
     A, b, motion = rows(R_is, x[3:6])
     residual = b - A[:, :, 3:] @ x[3:]
-    return float(np.median(np.linalg.norm(residual, axis=1)) / max(np.median(np.linalg.norm(motion, axis=1)), 1e-30))
+    of_imu = motion - b + A[:, :, 6:] @ x[6:]  # without gravity and bias
+    return float(np.median(np.linalg.norm(residual, axis=1)) / max(np.median(np.linalg.norm(of_imu, axis=1)), 1e-30))
 
 
 def is_mirrored(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> bool:

@@ -33,6 +33,7 @@ from icalib.sensors.position.walk_factor import OffsetWalk
 # Fixes further from every keyframe are left out, because residuals neglect the propagated IMU noise. A poor
 # accelerometer, of 0.01 m/s^2/sqrt(Hz), adds 1 mm to a position over this time.
 NEAR_KEYFRAME_S = 0.3
+MAX_REJECTED_SHARE = 0.5  # of the fixes of a sensor; with more, the median that bursts are measured from is a burst's
 
 
 KINDS = {"horizontal": slice(0, 2), "vertical": slice(2, 3)}
@@ -98,11 +99,12 @@ class PositionFactor(RowFactor):
         return replace(self, whitening=np.linalg.inv(np.linalg.cholesky(covariance)), walk=walk)
 
     def without_outliers(self, state: State, deviations: float) -> PositionFactor:
-        """This factor with `used` False for fixes whose residuals at `state` are outliers, single or in bursts."""
+        """This factor with `used` False for fixes whose residuals at `state` are outliers, single or in bursts. Most of
+        the fixes are no bursts: the trajectory or the noise is wrong then, and rejecting them would hide it."""
         out = output_at(self, state)
         raw = self.raw(out)
-        wrong = outliers_of(out.residual, raw, deviations) | bursts_of(self.seconds, raw, self.raw_sigma())
-        return replace(self, used=~wrong)
+        single, burst = outliers_of(out.residual, raw, deviations), bursts_of(self.seconds, raw, self.raw_sigma())
+        return replace(self, used=~(single | burst) if (single | burst).mean() <= MAX_REJECTED_SHARE else ~single)
 
     @property
     def key(self) -> FactorKey:

@@ -201,7 +201,7 @@ def _fit_to_imu(
     apart = fit_imu_trajectory(
         imu, trajectory.only(np.arange(len(trajectory.seconds)) % step == 0), rates, aligned, gravity, extrinsics
     )
-    return fit, 0.0 if apart is None else apart.unexplained
+    return fit, (fit if apart is None else apart).unexplained
 
 
 def _position_rotation_by_imu(imu: ImuData, stream: PoseStream, extrinsics: KnownExtrinsics) -> np.ndarray | None:

@@ -15,7 +15,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, motion_of, start_values
-from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.problem.inputs import Inputs, origin_difference
 from icalib.geometry import so3
 from icalib.initialize.steps.contradicted_guesses import known_value, merged_values, stated_values
 from icalib.initialize.steps.initializer import (
@@ -26,7 +26,7 @@ from icalib.initialize.steps.initializer import (
     OtherMotionError,
     Values,
 )
-from icalib.initialize.steps.rate_correlation import best_shifts
+from icalib.initialize.steps.rate_correlation import best_shifts, closest_of_equals
 from icalib.initialize.steps.single_recording import (
     KnownExtrinsics,
     converted_offset,
@@ -93,7 +93,8 @@ class PositionInitializer(Initializer[PositionSensor]):
 
     def fixes(self, recording: Measurements) -> list[Fixes]:
         """See `Initializer`."""
-        return [Fixes(s.seconds, s.position[:, 0] + 1j * s.position[:, 1]) for s in recording.of(PositionStream)]
+        streams = recording.of(PositionStream)
+        return [Fixes(s.seconds, s.position[:, 0] + 1j * s.position[:, 1], s.origin_ns) for s in streams]
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
         """See `Initializer`. Sensors with a frame come first, because sensors without one may share it."""
@@ -167,7 +168,7 @@ def _known_extrinsics(inputs: Inputs, sensor: PositionSensor) -> KnownExtrinsics
 def _fix(inputs: Inputs, sensor: PositionSensor) -> Fix:
     stream = inputs.stream(sensor.name)
     assert isinstance(stream, PositionStream)
-    return Fix(stream.seconds, stream.position)
+    return Fix(stream.seconds, stream.position, origin_difference(inputs.measurements, stream))
 
 
 def _is_levelled(inputs: Inputs, sensor: PositionSensor) -> bool:
@@ -249,7 +250,8 @@ def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> Pl
             f"{name}: too few of its fixes fall within the motion that the other sensors show; check that the clocks "
             "overlap, or the time_offset in the rig file."
         )
-    best = min(candidates, key=lambda x: x.misfit)
+    best = closest_of_equals(((x.misfit, x.offset, x) for x in candidates), fix.same_clock, 0.0)
+    assert best is not None
     if best.misfit > MAX_POSITION_MISFIT:
         hint = "check that both are on the same vehicle"
         if known.frame is not None:
@@ -264,11 +266,11 @@ def place(motion: EstimatedMotion, name: str, fix: Fix, known: KnownPlace) -> Pl
 
 
 def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> list[float]:
-    """Candidate time offsets [s]: the known one, or peaks of the correlation of mean speeds, then of third differences
-    with the IMU's readings. Speeds differ where the rig turns on the spot, by the lever arm."""
+    """Candidate time offsets [s]: the known one, or that of one clock, peaks of the correlation of mean speeds, then of
+    third differences with the IMU's readings. Speeds differ where the rig turns on the spot, by the lever arm."""
     if known.offset is not None:
         return [known.offset]
-    by_acceleration = [shift.samples / SIGNAL_RATE_HZ for shift in likely_offsets(motion.imu, fix)]
+    by_acceleration = [fix.same_clock, *(x.samples / SIGNAL_RATE_HZ for x in likely_offsets(motion.imu, fix))]
     state = motion.state
     motion_speeds = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
     fix_speeds = _speeds(fix.t, fix.position, fix.run)

@@ -41,15 +41,18 @@ ACCEL_BIAS_SIGMA_M_S2 = 0.3  # m/s^2
 ARM_SIGMA_M = 2.0  # m, of a car's antenna
 OFFSET_SIGMA_S = 0.3  # s, about a peak of the correlation
 ROTATION_SIGMA_RAD = 10.0  # rad: no prior
+N_YAWS = 24  # candidates of the first attitude
 MIN_TRIPLE_SIGMA_M_S = 0.05  # m/s, of a second difference of fixes with 2 cm of noise, 1 s apart
 
 
 @dataclass(frozen=True)
 class Fix:
-    """Fixes of one recording: t (N,) s on the sensor's clock, position (N, 3) m in its frame."""
+    """Fixes of one recording: t (N,) s on the sensor's clock, position (N, 3) m in its frame; same_clock: the time
+    offset [s] if one clock made all stamps."""
 
     t: np.ndarray
     position: np.ndarray
+    same_clock: float = 0.0
 
     @cached_property
     def run(self) -> np.ndarray:
@@ -58,11 +61,29 @@ class Fix:
         at, _ = steps(self.t, self.position)
         return np.cumsum(np.bincount(at, minlength=len(self.t)))
 
-    @property
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of a fix [m], root of the sum over the axes, by the median absolute fourth differences,
+        which contain little motion; at least 1 mm. 70: sum of squared binomials; 1.48: ratio of sigma to the median."""
+        fourth = np.abs(np.diff(self.position, n=4, axis=0))
+        return max(1e-3, float(np.linalg.norm(1.4826 / np.sqrt(70.0) * np.median(fourth, axis=0))))
+
+    @cached_property
     def triples(self) -> Triples:
-        """Triples of fixes about a second apart, without a step of the solution between them."""
-        triples = triples_of(self.t)
-        return triples.some(self.run[triples.i] == self.run[triples.k])
+        """Triples of fixes without a step of the solution between them. They are as far apart as their noise demands:
+        velocities change more in a longer time, and noise changes them less."""
+        candidates: list[Triples] = []
+        for step in TRIPLE_STEPS_S:
+            triples = triples_of(self.t, step)
+            candidates.append(triples.some(self.run[triples.i] == self.run[triples.k]))
+            if len(candidates[-1].i) < MIN_WINDOW_TRIPLES or self.noise_share(candidates[-1]) < MAX_TRIPLE_NOISE:
+                break
+        return next((x for x in reversed(candidates) if len(x.i) >= MIN_WINDOW_TRIPLES), candidates[0])
+
+    def noise_share(self, triples: Triples) -> float:
+        """RMS of the noise in second differences over `triples`, over their RMS."""
+        size = np.sqrt((triples.second(self.position) ** 2).sum(axis=1).mean())
+        return float(np.sqrt(6.0) * self.noise / np.median(triples.half) / max(size, 1e-9))
 
 
 @dataclass(frozen=True)
@@ -126,17 +147,34 @@ def sigmas(arm: float = ARM_SIGMA_M, offset: float = OFFSET_SIGMA_S) -> np.ndarr
     return np.append(np.repeat(groups, 3), offset)
 
 
-def first_attitude(
-    imu: ImuData, fix: Fix, triples: Triples, reference: float, offset: float, gravity: float
-) -> np.ndarray:
-    """R_wg (3, 3) by Kabsch: rotates the double integrals of specific force onto the second differences of the fixes
-    plus gravity."""
-    t = fix.t + offset
-    integrated = IntegratedReadings.of(imu, span_of(t, triples), reference, np.zeros(3), forces_only=True)
+def first_unknowns(
+    imu: ImuData, fix: Fix, triples: Triples, mean: WindowUnknowns, sigma: np.ndarray, gravity: float
+) -> WindowUnknowns:
+    """The prior `mean`, of standard deviations sigma (13,), with estimates of attitude, accelerometer bias and lever
+    arm. For a known attitude the equations are linear. Candidates are Kabsch's attitude for the lever arm of `mean`,
+    and all yaws of the one that levels the specific forces; Kabsch's method refines the best."""
+    t = fix.t + mean.offset
+    integrated = IntegratedReadings.of(imu, span_of(t, triples), mean.reference, np.zeros(3))
     differences = triples.second(fix.position)
     differences[:, 2] += gravity * triples.half
-    felt = triples.second(integrated.doubles_at(t)[:, :3])
-    return so3.closest_rotation(differences.T @ felt)
+    doubles, rotation = integrated.doubles_at(t), integrated.rotation_at(t)
+    felt = triples.second(doubles[:, :3] + rotation @ mean.arm)
+    J = np.concatenate([-triples.second(doubles[:, 3:12]).reshape(-1, 3, 3), triples.second(rotation)], axis=2)
+    inverse = np.linalg.inv(np.einsum("nij,nik->jk", J, J) + np.diag((MIN_TRIPLE_SIGMA_M_S / sigma[6:12]) ** 2))
+
+    def fitted(R: np.ndarray) -> tuple[float, np.ndarray]:
+        """Sum of squared residuals with the best bias and lever arm, and both (6,)."""
+        r = differences @ R - felt
+        b = np.einsum("nij,ni->j", J, r)
+        return float((r**2).sum() - b @ inverse @ b), inverse @ b
+
+    level = so3.closest_rotation(np.outer([0.0, 0.0, 1.0], felt.sum(axis=0)) + np.diag([1e-6, 1e-6, 0.0]))
+    yaws = np.linspace(0.0, 2.0 * np.pi, N_YAWS, endpoint=False)[:, None] * [0.0, 0.0, 1.0]
+    candidates = [so3.closest_rotation(differences.T @ felt), *(so3.exp_many(yaws) @ level)]
+    _, x = fitted(min(candidates, key=lambda R: fitted(R)[0]))
+    R = so3.closest_rotation(differences.T @ (felt + J @ x))
+    _, x = fitted(R)
+    return replace(mean, R_wg=R, accel_bias=mean.accel_bias + x[:3], arm=mean.arm + x[3:])
 
 
 def fit_window(
@@ -198,16 +236,17 @@ def span_of(t: np.ndarray, triples: Triples) -> tuple[float, float]:
 
 
 # s, between the fixes of a triple. A second difference has 5 cm/s by noise of 2 cm, and about 1 m/s by the motion of a
-# walk or a car. A gyroscope drifts by less than a degree meanwhile.
-TRIPLE_STEP_S = 1.0
-MAX_TRIPLE_STEPS = 1.6  # times the step, TRIPLE_STEP_S or that of slower fixes: beyond it there is a gap
+# walk or a car. A gyroscope drifts by less than a degree meanwhile. Longer ones are for more noise or a slower motion.
+TRIPLE_STEPS_S = 1.0, 2.0, 4.0
+MAX_TRIPLE_NOISE = 0.25  # noise over size of second differences: with more, the next step is taken
+MAX_TRIPLE_STEPS = 1.6  # times the step, or that of slower fixes: beyond it there is a gap
 WINDOW_MARGIN_S = 0.2  # s of readings on both sides of the fixes of a window, as the time offset changes in the fit
 
 
-def triples_of(t: np.ndarray) -> Triples:
-    """All triples of fixes at increasing t (N,) s that are about TRIPLE_STEP_S apart; of slower fixes, neighbours."""
-    usual = float(np.median(np.diff(t))) if len(t) > 1 else TRIPLE_STEP_S
-    step = max(TRIPLE_STEP_S, usual)
+def triples_of(t: np.ndarray, step: float) -> Triples:
+    """All triples of fixes at increasing t (N,) s that are about `step` s apart; of slower fixes, neighbours."""
+    usual = float(np.median(np.diff(t))) if len(t) > 1 else step
+    step = max(step, usual)
     i = np.arange(len(t))
     j = np.searchsorted(t, t + step - 0.1 * usual)
     k = np.searchsorted(t, t[np.minimum(j, len(t) - 1)] + step - 0.1 * usual)
@@ -344,6 +383,12 @@ def _of_imu(imu: ImuData) -> tuple[np.ndarray, np.ndarray]:
     third = (x[3] - 3.0 * x[2] + 3.0 * x[1] - x[0]) / DIFFERENCE_STEP_S**2
     inside = imu.covers(middle - 1.5 * DIFFERENCE_STEP_S, middle + 1.5 * DIFFERENCE_STEP_S)
     return np.where(inside, np.linalg.norm(third, axis=1), 0.0), inside
+
+
+def change_of_acceleration(imu: ImuData) -> float:
+    """Root of the median square of the third differences over DIFFERENCE_STEP_S [m/s^2], by the readings."""
+    third, known = _of_imu(imu)
+    return float(np.sqrt(np.median(third[known] ** 2))) if known.any() else 0.0
 
 
 def _on_grid(t: np.ndarray, x: np.ndarray, end: float, apart: float) -> tuple[np.ndarray, np.ndarray]:

@@ -14,9 +14,11 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.initialize.steps.initializer import OtherMotionError
 from icalib.initialize.steps.lever_arm import Triples
+from icalib.initialize.steps.rate_correlation import closest_of_equals
 from icalib.initialize.steps.single_recording import KnownExtrinsics
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.position.initialize.attitude import (
+    MAX_TRIPLE_NOISE,
     MIN_JERK_CORRELATION,
     MIN_WINDOW_TRIPLES,
     SIGNAL_RATE_HZ,
@@ -25,7 +27,8 @@ from icalib.sensors.position.initialize.attitude import (
     WindowFit,
     WindowPrior,
     WindowUnknowns,
-    first_attitude,
+    change_of_acceleration,
+    first_unknowns,
     fit_window,
     likely_offsets,
     recorded,
@@ -37,13 +40,13 @@ MAX_HALF_WINDOW_S = 60.0  # of the largest window: biases are modelled as consta
 # A misfit above the first leads to a second fit with east and north swapped. They were swapped if that misfit is less
 # than the second number times the first misfit.
 SUSPICIOUS_MISFIT, MIRRORED_RATIO = 0.15, 0.5
-MAX_ACCELERATION_MISFIT = 0.3  # largest `WindowFit.misfit`: fixes of another motion have 0.4 or more
+MAX_ACCELERATION_MISFIT = 0.3  # largest `WindowFit.misfit` beside noise: fixes of another motion have 0.4 or more
 MAX_OFFSETS_TRIED = 4  # candidates, by correlation
 # Standard deviations between neighbouring windows: gyroscope drift over a window, and changes of biases.
 NEXT_ROTATION_SIGMA_RAD, NEXT_GYRO_BIAS_SIGMA_RAD_S, NEXT_ACCEL_BIAS_SIGMA_M_S2 = 0.1, 5e-3, 0.1
 KNOWN_ARM_SIGMA_M, KNOWN_OFFSET_SIGMA_S = 1e-3, 0.01  # a clock that drifts by 20 ppm has 10 ms in 500 s
-MIN_ACCELERATION_M_S2 = 0.02  # RMS over a second: accelerometer biases vary by as much
-MIN_ACCELERATION_NOISE_RATIO = 1.5  # RMS acceleration of fixes over what their noise makes of it: less is no motion
+MAX_NOISE_SHARE = 0.5  # of the change of acceleration that the IMU shows: more noise hides the lever arm
+MAX_EVEN_NOISE = 0.7  # noise over size of second differences: with more, the fixes show no motion
 VELOCITY_STEP_S = 0.25  # of central differences: noise of 2 cm makes 6 cm/s
 
 
@@ -105,64 +108,60 @@ def motion_from_fixes(imu: ImuData, name: str, fix: Fix, gravity: float, known: 
             f"{name}: only {len(triples.i)} groups of three fixes about a second apart are usable, and "
             f"{MIN_WINDOW_TRIPLES} are needed; record for longer, or lower least_status in the rig file."
         )
-    offsets, rms = _candidate_offsets(imu, fix, known), _moves_evenly(fix, triples)
-    if not offsets:
-        raise _motionless(name, rms) if rms is not None else _contradicting(imu, name, 1.0, False)
+    offsets = _candidate_offsets(imu, fix, known)
     fits = [one for x in offsets if (one := _fit_at_offset(imu, fix, triples, x, gravity, known)) is not None]
-    if not fits:
+    closest = closest_of_equals(((one[0].misfit, one[0].at.offset, one) for one in fits), fix.same_clock, 0.0)
+    if closest is None:
         raise OtherMotionError(
             f"{name}: too few of its fixes fall within the recording of {imu.name}; check that both come from the same "
             "recording, or the time_offset in the rig file."
         )
-    best, window = min(fits, key=lambda one: one[0].misfit)
-    if best.misfit > MAX_ACCELERATION_MISFIT and rms is not None:
-        raise _motionless(name, rms)
+    best, window = closest
     if best.misfit > SUSPICIOUS_MISFIT:
         other = replace(fix, position=fix.position[:, [1, 0, 2]])
         tried = [one for x in offsets if (one := _fit_at_offset(imu, other, triples, x, gravity, known)) is not None]
         mirrored = min((one[0].misfit for one in tried), default=np.inf) < MIRRORED_RATIO * best.misfit
-        if mirrored or best.misfit > MAX_ACCELERATION_MISFIT:
-            raise _contradicting(imu, name, best.misfit, mirrored)
+        _check_misfit(imu, name, fix, best.misfit, mirrored)
     usable = recorded(imu, triples, fix.t + best.at.offset)
     return PositionMotion(imu, fix, best, _all_windows(imu, fix, usable, (best, window), gravity))
-
-
-def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> EstimationError:
-    sentence = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
-    if mirrored:
-        return EstimationError(
-            f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
-            "of x and y, by `columns: [...]` in the rig file."
-        )
-    return OtherMotionError(
-        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
-        "(accel_unit, gyro_unit)."
-    )
-
-
-def _motionless(name: str, rms: float) -> EstimationError:
-    return EstimationError(
-        f"{name}: its fixes are motionless or move evenly (accelerations of {rms:.2g} m/s^2, no more than noise); "
-        "record again while speeding up, braking and turning."
-    )
 
 
 def _candidate_offsets(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[float]:
     """Time offsets to be tried [s]: the known one, or the highest correlations."""
     if known.offset is not None:
         return [known.offset]
-    shifts = likely_offsets(imu, fix)
-    return [s.samples / SIGNAL_RATE_HZ for s in shifts if s.correlation > MIN_JERK_CORRELATION][:MAX_OFFSETS_TRIED]
+    likely = [s.samples / SIGNAL_RATE_HZ for s in likely_offsets(imu, fix) if s.correlation > MIN_JERK_CORRELATION]
+    return [*likely[:MAX_OFFSETS_TRIED], fix.same_clock]
 
 
-def _moves_evenly(fix: Fix, triples: Triples) -> float | None:
-    """RMS acceleration of the fixes [m/s^2] if it is no more than noise, else None. Fourth differences, which contain
-    little motion, show the noise."""
-    acceleration = triples.second(fix.position) / triples.half[:, None]
-    fourth = np.diff(fix.position, n=4, axis=0)
-    rms, noise = (float(np.sqrt(np.median((x**2).sum(axis=1)))) for x in (acceleration, fourth))
-    by_noise = noise / np.sqrt(70.0) * np.sqrt(6.0) / float(np.median(triples.half)) ** 2  # sums of squared binomials
-    return rms if rms < MIN_ACCELERATION_NOISE_RATIO * by_noise or rms < MIN_ACCELERATION_M_S2 else None
+def _check_misfit(imu: ImuData, name: str, fix: Fix, misfit: float, mirrored: bool) -> None:
+    """Raises EstimationError if fixes and readings contradict each other, or the acceleration is no more than noise.
+    Third differences over a second, of the IMU, show how much it changes."""
+    sentence = f"{name}: {imu.name} does not explain {misfit:.0%} of its acceleration at any time offset"
+    if mirrored:
+        raise EstimationError(
+            f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
+            "of x and y, by `columns: [...]` in the rig file."
+        )
+    share = fix.noise_share(fix.triples)
+    if misfit <= np.hypot(MAX_ACCELERATION_MISFIT, min(share, MAX_TRIPLE_NOISE)):
+        return
+    felt, by_noise, rate = change_of_acceleration(imu), np.sqrt(20.0) * fix.noise, 1.0 / np.median(np.diff(fix.t))
+    if by_noise > MAX_NOISE_SHARE * felt:
+        raise EstimationError(
+            f"{name}: its fixes are too noisy for {imu.name} alone: {fix.noise:.2g} m at {rate:.2g} Hz change the "
+            f"acceleration by {by_noise:.2g} m/s^2 in a second, and the motion changes it by {felt:.2g}. Use fixes of "
+            "less noise (RTK), move faster, or add wheels or an odometry, which show the motion."
+        )
+    if share > MAX_EVEN_NOISE:
+        raise EstimationError(
+            f"{name}: its fixes are motionless or move evenly, beside noise of {fix.noise:.2g} m; record again while "
+            "speeding up, braking and turning."
+        )
+    raise OtherMotionError(
+        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
+        "(accel_unit, gyro_unit)."
+    )
 
 
 def _fit_at_offset(
@@ -182,14 +181,13 @@ def _fit_at_offset(
     within = _within(fix, usable, centre - half, centre + half)
     if len(within.i) < MIN_WINDOW_TRIPLES:
         within = usable
-    R = first_attitude(imu, fix, within, centre + offset, offset, gravity)
-    no = np.zeros(3)
-    start = mean = WindowUnknowns(centre + offset, R, no, no, no if arm is None else arm, offset)
-    sigma = sigmas()
+    no, sigma = np.zeros(3), sigmas()
+    mean = WindowUnknowns(centre + offset, np.eye(3), no, no, no if arm is None else arm, offset)
     if arm is not None:
         sigma[9:12] = KNOWN_ARM_SIGMA_M
     if known.offset is not None:
         sigma[12] = KNOWN_OFFSET_SIGMA_S
+    start = first_unknowns(imu, fix, within, mean, sigma, gravity)
     while True:
         fitted = fit_window(imu, fix, within, start, WindowPrior(replace(mean, R_wg=start.R_wg), sigma), gravity)
         window = centre - half, centre + half

@@ -181,9 +181,9 @@ def drive_guess(
     w, u = rate @ axis, velocity @ level.T
     _check_motion(name, w, u)
     e2, l1 = _no_slip(w, u)
-    _check_lateral_slip(name, u @ e2 + l1 * w, u)
-    e1 = np.array([e2[1], -e2[0]])
     forwards = wheel_rate[:, :2].sum(axis=1) if kind == "pair" else wheel_rate[:, 0]
+    _check_lateral_slip(name, u @ e2 + l1 * w, np.column_stack([u, w]), forwards)
+    e1 = np.array([e2[1], -e2[0]])
     if _robust_fit(np.column_stack([u @ e1, w]), forwards)[0] < 0.0:  # e_1 must point forwards
         e1, e2, l1 = -e1, -e2, -l1
     _check_independence(name, w, u @ e1)
@@ -311,18 +311,26 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
         )
 
 
-def _check_lateral_slip(name: str, slip: np.ndarray, velocity: np.ndarray) -> None:
-    """Raises MotionContradictedError if no point of the vehicle moves along one axis only, as wheels force it to.
+def _check_lateral_slip(name: str, slip: np.ndarray, motion: np.ndarray, forwards: np.ndarray) -> None:
+    """Raises EstimationError if no point of the vehicle moves along one axis only, as wheels force it to.
 
-    slip (n,) [m/s]: lateral speed for the best axis; velocity (n, 2) [m/s].
+    slip (n,) [m/s]: lateral speed for the best axis; motion (n, 3): velocity [m/s] and yaw rate [rad/s]; forwards (n,):
+    rate that the wheels measure. If the motion explains it, the vehicle moves sideways; else MotionContradictedError.
     """
-    share = float(np.sqrt(np.mean(slip**2) / np.mean((velocity**2).sum(axis=1))))
-    if share > MAX_LATERAL_SLIP:
-        raise MotionContradictedError(
-            f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % "
-            "of its speed; check that the sensor that shows its motion is on this vehicle, and how its poses "
-            "are written."
+    share = np.linalg.norm(slip) / np.linalg.norm(motion[:, :2])
+    if share <= MAX_LATERAL_SLIP:
+        return
+    left = forwards - motion @ _robust_fit(motion, forwards)
+    if np.linalg.norm(left) < MAX_LATERAL_SLIP * np.linalg.norm(forwards):
+        raise EstimationError(
+            f"{name}: its speed fits the motion along one axis, but the vehicle moves sideways as well, by "
+            f"{share:.0%} of its speed. Drives with mecanum or omni wheels are not supported; give its odometry as a "
+            "sensor of type: pose with kind: relative."
         )
+    raise MotionContradictedError(
+        f"{name}: the vehicle drives along none of its axes, its lateral slip would be {100 * share:.0f} % of its "
+        "speed; check that the sensor that shows its motion is on this vehicle, and how its poses are written."
+    )
 
 
 def _check_independence(name: str, w: np.ndarray, ahead: np.ndarray) -> None:

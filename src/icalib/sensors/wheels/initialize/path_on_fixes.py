@@ -21,7 +21,7 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.initialize.steps.contradicted_guesses import merged_values
 from icalib.initialize.steps.initializer import Fixes, Values
-from icalib.initialize.steps.rate_correlation import MaskedSignal, best_shifts
+from icalib.initialize.steps.rate_correlation import MaskedSignal, best_shifts, closest_of_equals
 from icalib.initialize.steps.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
 from icalib.sensors.wheels.initialize.planar_path import PlanarSteps, planar_poses, planar_steps, with_sizes
@@ -67,7 +67,8 @@ def paths_on_fixes(
     except guesses that contradict the recording with most fixes. Raises EstimationError as `path_on_fixes`."""
     sized = with_sizes(wheels)
     paths = [
-        path_on_fixes(wheels.name, planar_steps(sized, stream), f) for stream, f in zip(streams, fixes, strict=True)
+        path_on_fixes(wheels.name, planar_steps(sized, stream), f, (f.origin_ns - stream.origin_ns) * 1e-9)
+        for stream, f in zip(streams, fixes, strict=True)
     ]
     _, r, k = paths[int(np.argmax([len(f.t) for f in fixes]))]
     factors = _size_factors(wheels, r, k)
@@ -86,11 +87,13 @@ def _size_factors(wheels: Wheels, r: float, k: float) -> dict[str, np.ndarray]:
     return {sizes[0]: np.array([r, k])} if len(sizes) == 1 else dict(zip(sizes, np.array([r, r / k]), strict=True))
 
 
-def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes) -> PathOnFixes:
-    """The path of the wheels `name` that follows the fixes. Raises EstimationError if their motion does not match at
-    any time offset."""
-    fits = [fit for start in _starts(steps, fixes) if (fit := _fitted(steps, fixes, start)) is not None]
-    best = min(fits, key=lambda fit: fit.misfit, default=None)
+def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes, same_clock: float = 0.0) -> PathOnFixes:
+    """The path of the wheels `name` that follows the fixes. same_clock: the time offset [s] of stamps by one clock,
+    which decides between offsets that fit equally well. Raises EstimationError if their motion does not match at any
+    time offset."""
+    starts = _starts(steps, fixes, same_clock)
+    fits = [fit for start in starts if (fit := _fitted(steps, fixes, start)) is not None]
+    best = closest_of_equals(((fit.misfit, fit.unknowns[5], fit) for fit in fits), same_clock, MIN_SIGMA_M)
     if best is None or best.misfit > MAX_MISFIT * best.spread:
         raise EstimationError(
             f"{name}: its speeds and turns do not match those of the positions at any time offset; check that both are "
@@ -99,8 +102,8 @@ def path_on_fixes(name: str, steps: PlanarSteps, fixes: Fixes) -> PathOnFixes:
     return PathOnFixes(_followed(steps, best), *np.exp(best.unknowns[:2]).tolist())
 
 
-def _starts(steps: PlanarSteps, fixes: Fixes) -> list[np.ndarray]:
-    """Start values (6,) of the unknowns at peaks of the correlation of speeds and of turns."""
+def _starts(steps: PlanarSteps, fixes: Fixes, same_clock: float) -> list[np.ndarray]:
+    """Start values (6,) of the unknowns at peaks of the correlation of speeds and of turns, and at `same_clock`."""
     grid = np.arange(0.0, steps.seconds[-1] - 2.0 * STEP_S, 1.0 / SIGNAL_HZ)
     ahead = _changes(grid, steps.seconds, steps.distance)
     turn = _changes(grid + 0.5 * STEP_S, steps.seconds, steps.yaw)
@@ -112,7 +115,9 @@ def _starts(steps: PlanarSteps, fixes: Fixes) -> list[np.ndarray]:
         if len(grid) and b[1].any()
         for peak in best_shifts((a, known), b, MIN_OVERLAP_S * SIGNAL_HZ, MAX_PEAKS, apart)
     }
-    starts = []
+    same, starts = round(same_clock * SIGNAL_HZ), []
+    if -len(speed) < same < len(grid):
+        shifts.add(same)
     for shift in sorted(shifts):
         j = np.arange(max(0, -shift), min(len(speed), len(grid) - shift))
         r, k = _slope(ahead[j + shift], speed[j], seen[j]), _slope(turn[j + shift], course[j], moving[j])
@@ -151,7 +156,7 @@ def _fitted(steps: PlanarSteps, fixes: Fixes, start: np.ndarray) -> _DriftFit | 
     inside = (t > steps.seconds[0]) & (t < steps.seconds[-1])
     if inside.sum() < 2 * MIN_WINDOW_FIXES:
         return None
-    fixes, x = Fixes(fixes.t[inside], fixes.z[inside]), start
+    fixes, x = fixes._replace(t=fixes.t[inside], z=fixes.z[inside]), start
     window = _windows(steps, fixes, start[5])
     sigma = PRIOR_SIGMA * ([1.0] * 6 if steps.scaled else [1e-6, 1e-6, 1e-6, 1.0, 1.0, 1.0])
     size = np.zeros(0)
