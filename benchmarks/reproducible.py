@@ -145,7 +145,8 @@ def _in_subprocess(chosen: list[Any], variant: str, data: Path) -> Record | None
     limit = (lambda: os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})) if one else None
     done = subprocess.run(command, capture_output=True, text=True, env=environment, preexec_fn=limit)
     if done.returncode:
-        print(done.stderr.strip().splitlines()[-1][:200], file=sys.stderr)
+        last = done.stderr.strip().splitlines()[-1:] or [f"ended by signal {-done.returncode}"]
+        print(last[0][:200], file=sys.stderr)
         return None
     return Record(**json.loads(done.stdout.splitlines()[-1]))
 

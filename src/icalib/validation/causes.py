@@ -105,14 +105,14 @@ def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeli
     """The change that explains clearly more than all others, if there is one. Two that explain as much are named
     together if they are the same change, seen from either sensor, or changes of one sensor."""
     by_gain, spread = changes(segments, inputs.sensors), scatter(segments)
-    if not by_gain or by_gain[0].gain < CHANGES * spread.gain or not spread.exceeded_by(by_gain[0]):
+    if not by_gain or by_gain[0].gain < CHANGES * spread.beyond_chance or not spread.exceeded_by(by_gain[0]):
         return
     best = by_gain[0]
     alike = [c for c in by_gain if c.gain > ALIKE * best.gain]
     kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
     if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
         words = _change_words(alike, segments, timeline)
-        share = f" This explains {best.gain / spread.gain:.0%} of what varies over the recording."
+        share = f" This explains {min(best.gain / spread.beyond_chance, 1.0):.0%} of what varies over the recording."
         yield Cause(words + share, best.gain, misfit.is_grave or _is_large(best, segments))
 
 

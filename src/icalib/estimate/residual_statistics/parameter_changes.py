@@ -66,6 +66,11 @@ class Scatter:
     gain: float
     dof: float
 
+    @property
+    def beyond_chance(self) -> float:
+        """The gain beyond that of noise, which is one for each direction."""
+        return max(self.gain - self.dof, 1.0)
+
     def exceeded_by(self, change: Change) -> bool:
         """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves. One
         that gains more than separate parameters is none: it moves what no segment shows, as a frame that drifts."""
