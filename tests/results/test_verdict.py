@@ -52,10 +52,10 @@ def cases(calibration: Calibration) -> dict[str, Calibration]:
     }
 
 
-def console_of(c: Calibration) -> str:
+def console_of(c: Calibration, verbose: bool = False) -> str:
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        print_result(c, Path("out"))
+        print_result(c, Path("out"), verbose)
     return " ".join(out.getvalue().split())
 
 
@@ -63,10 +63,8 @@ def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Cal
     """And its legend says what the words of the table mean."""
     c = cases["not usable: wrong and open"]
     monkeypatch.setenv("LINES", "5")
-    shown = console_of(c)
-    assert shown.startswith(
-        f"Verdict: {c.verdict}. {NEXT[c.verdict]} First of {len(c.reasons)} reasons: {c.reasons[0]}"
-    )
+    shown = console_of(c, verbose=True)
+    assert shown.startswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]} Reason 1 of {len(c.reasons)}: {c.reasons[0]}")
     assert shown.endswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]}") and "bloom: dark edges" in shown
     monkeypatch.setenv("LINES", "500")
     assert console_of(c).startswith("Calibration")
@@ -188,7 +186,7 @@ def test_verdicts_without_weight_are_in_brackets(cases: dict[str, Calibration], 
         bracketed = {v for v in found if v.startswith("(")}
         assert (c.verdict == "usable" or bool(c.warnings)) or found - bracketed, name
         assert c.verdict != "usable" or found == bracketed, name
-        assert ("In brackets: without weight" in console_of(c)) == bool(bracketed), name
+        assert ("In brackets: without weight" in console_of(c, verbose=True)) == bool(bracketed), name
     assert {r.verdict for r in rows(cases["usable: prior"]) if r.name == "time offset"} == {"(weak)"}
     assert {r.verdict for r in rows(cases[lens]) if r.name == "fx"} == {"(weak)"}
 
