@@ -218,17 +218,22 @@ def test_the_baseline_is_that_of_samples(calibration: Calibration):
     assert f"baseline {1e3 * r.distance:.2f} +- " in console_of(calibration)
 
 
-@pytest.mark.parametrize("quiet", [False, True])
+@pytest.mark.parametrize("flags", [[], ["-q"], ["-v"]])
 def test_the_exit_code_of_strict(
-    cases: dict[str, Calibration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quiet: bool
+    cases: dict[str, Calibration],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
 ):
-    """Without --strict 0, whatever the verdict; with it that of the verdict."""
+    """Without --strict 0, whatever the verdict; with it that of the verdict. The board's shape is printed by -v."""
     rig = tmp_path / "rig.yaml"
     rig.write_text((Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml").read_text())
     monkeypatch.setattr("icalib.export.outputs.write_outputs", lambda *_: None)
-    command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *(["-q"] if quiet else [])]
+    command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *flags]
     for name in ("usable", "usable with care: weak", "partly usable", "not usable: wrong"):
         monkeypatch.setattr("icalib.pipeline.calibrate", lambda *_, c=cases[name], **__: c)
         assert main(command) == 0
         assert main([*command, "--strict"]) == EXIT_CODES[cases[name].verdict]
+        assert ("shape bow xx" in capsys.readouterr().out) == (flags == ["-v"])
     assert list(EXIT_CODES.values()) == [0, 3, 4, 5]
