@@ -387,6 +387,20 @@ def test_the_console_shows_what_a_reason_names(calibration: Calibration, reason:
     assert [(row.sensor, row.name) for row in shown if row not in brief] == rows_named
 
 
+def test_the_console_shows_intrinsics_of_an_imu_whose_verdict_counts(calibration: Calibration):
+    """Also where the reason names others first, and not those of a lens, whose verdict is on its line."""
+    groups = tuple(
+        dataclasses.replace(
+            g, mode="free", columns=g.columns or tuple(range(len(g.labels))), verdict=("weak",) * len(g.labels)
+        )
+        for g in calibration.groups
+    )
+    c = dataclasses.replace(calibration, groups=groups, warnings=(), unobservable=())
+    assert not any("imu0 intrinsics" in reason for reason in c.reasons)
+    weak = {(row.sensor, row.group) for row in shown_rows(c, verbose=False)}
+    assert ("imu0", "intrinsics") in weak and ("cam0", "intrinsics") not in weak and ("board0", "shape") not in weak
+
+
 def test_a_lens_is_one_line_of_the_console(calibration: Calibration):
     """With its projection uncertainty; model and distortion only where they fit. A fixed lens has no uncertainty."""
     sigma = calibration.lens_projections_px["cam0"]

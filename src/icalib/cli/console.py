@@ -102,9 +102,8 @@ def print_verdict(calibration: Calibration, console: Console) -> None:
     console.print(_verdict_line(calibration))
 
 
-def _verdict_line(calibration: Calibration) -> Text:
-    verdict = calibration.verdict
-    return Text.assemble("Verdict: ", (verdict, VERDICT_STYLES[verdict]), f". {NEXT[verdict]}")
+def _verdict_line(c: Calibration) -> Text:
+    return Text.assemble("Verdict: ", (c.verdict, VERDICT_STYLES[c.verdict]), f". {NEXT[c.verdict]}")
 
 
 def print_warnings(calibration: Calibration) -> None:

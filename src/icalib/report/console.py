@@ -21,11 +21,13 @@ STYLES = {"determined": "green", "weak": "yellow", "fixed": "dim"} | dict.fromke
 
 def shown_rows(c: Calibration, verbose: bool) -> list[Row]:
     """Rows of the table, extrinsics and time offsets of all sensors first. Rows of lenses, IMU intrinsics and auxiliary
-    parameters are there only if `verbose`, or if a reason names them."""
+    parameters are there only if `verbose`, if a reason names them, or if a bad verdict on them counts."""
     out, reasons = list[Row](), " ".join(c.reasons).replace("_", " ")
     for r in sorted(table_rows(c), key=lambda r: r.group not in MOUNTED_NAMES):
         names = (f"{r.sensor} {r.group}", f"{r.group} of {r.sensor}", f"{r.name} of {r.sensor}")
-        if verbose or r.group not in (*LENS, *AUXILIARY) or any(n.replace("_", " ") in reasons for n in names):
+        is_named = any(name.replace("_", " ") in reasons for name in names)
+        counts = r.verdict in WORST_FIRST[:3] and r.sensor not in c.lenses  # a lens has its line, with its verdict
+        if verbose or is_named or counts or r.group not in (*LENS, *AUXILIARY):
             out.append(r)
     return out
 
@@ -51,8 +53,7 @@ def lens_words(c: Calibration, width: int) -> list[str]:
         groups = [g for g in c.groups if g.sensor == camera and g.name in names]
         values = [[f"{r.name} {r.value}" for r in entries if (r.sensor, r.group) == (camera, n)] for n in names]
         sigma, verdict = c.lens_projections_px[camera], worst(tuple(v for g in groups for v in counted(c, g)))
-        size = f"projection +- {format_number(np.nan if sigma is None else sigma)} px"
-        size = "fixed" if all(g.columns is None for g in groups) else size
+        size = f"projection +- {format_number(sigma or np.nan)} px" if any(g.columns for g in groups) else "fixed"
         line = f"{camera} lens: {' '.join(values[0])} px, {size}" + f", {verdict}" * (verdict in WORST_FIRST[:3])
         longer = f"{line}, {c.rig['sensors'][camera]['model']}"
         longest = " ".join([longer, *values[1]])
