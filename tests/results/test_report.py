@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.export.outputs import check_folder, write_outputs
 from icalib.report import report_html
-from icalib.report.console import relative_words, table
+from icalib.report.console import legend, lens_words, relative_words, shown_rows, table
 from icalib.report.plot import numbers, thin
 from icalib.result import (
     Calibration,
@@ -352,11 +352,75 @@ def test_numbers_and_thinning():
 def test_console_table(calibration: Calibration):
     console = Console(width=120, record=True, file=open("/dev/null", "w"))  # noqa: SIM115
     with console.file:
-        console.print(table(calibration))
+        console.print(table(shown_rows(calibration, verbose=True)))
         text = console.export_text()
     line = next(line for line in text.splitlines() if "translation y" in line and "45.4" in line)
     assert "unobservable" in line and "mm" in line
     assert len([line for line in text.splitlines() if line.startswith("│")]) == len(rows(calibration))
+
+
+def test_the_console_begins_with_extrinsics_and_time_offsets(calibration: Calibration):
+    """Lenses, IMU intrinsics and auxiliary parameters are behind `-v`, and the legend counts them."""
+    c = dataclasses.replace(calibration, warnings=(), unobservable=())
+    entries, everything = shown_rows(c, verbose=False), shown_rows(c, verbose=True)
+    mounted = {"rotation", "translation", "time_offset"}
+    assert {row.group for row in entries if row.sensor in ("cam0", "cam1")} == mounted
+    assert [row.group in mounted for row in everything] == sorted(row.group in mounted for row in everything)[::-1]
+    assert everything[: len(entries)] == entries
+    more = f"-v adds {len(everything) - len(entries)} rows: intrinsics, distortion,"
+    assert more in legend(c, entries) and "-v" not in legend(c, everything)
+    assert "bloom: dark edges" in legend(c, everything) and "bloom: dark edges" not in legend(c, entries)
+
+
+@pytest.mark.parametrize(
+    ("reason", "rows_named"),
+    [
+        ("the fixed value of distortion k1 of cam0, -0.28, contradicts the data", [("cam0", "k1")]),
+        ("the intrinsics of cam1 do not fit", [("cam1", name) for name in ("fx", "fy", "cx", "cy")]),
+        ("imu0 gyroscope with cam1 bloom: not determined by this motion", [("cam1", "bloom")]),
+        ("the prior of shape bow_xx of board0 contradicts the data", [("board0", "shape bow xx")]),
+    ],
+)
+def test_the_console_shows_what_a_reason_names(calibration: Calibration, reason: str, rows_named: list):
+    brief = shown_rows(dataclasses.replace(calibration, warnings=(), unobservable=()), verbose=False)
+    shown = shown_rows(dataclasses.replace(calibration, warnings=(reason,), unobservable=()), verbose=False)
+    assert [(row.sensor, row.name) for row in shown if row not in brief] == rows_named
+
+
+def test_the_console_shows_intrinsics_of_an_imu_whose_verdict_counts(calibration: Calibration):
+    """Also where the reason names others first, and not those of a lens, whose verdict is on its line."""
+    groups = tuple(
+        dataclasses.replace(
+            g, mode="free", columns=g.columns or tuple(range(len(g.labels))), verdict=("weak",) * len(g.labels)
+        )
+        for g in calibration.groups
+    )
+    c = dataclasses.replace(calibration, groups=groups, warnings=(), unobservable=())
+    assert not any("imu0 intrinsics" in reason for reason in c.reasons)
+    weak = {(row.sensor, row.group) for row in shown_rows(c, verbose=False)}
+    assert ("imu0", "intrinsics") in weak and ("cam0", "intrinsics") not in weak and ("board0", "shape") not in weak
+
+
+def test_a_lens_is_one_line_of_the_console(calibration: Calibration):
+    """With its projection uncertainty; model and distortion only where they fit. A fixed lens has no uncertainty."""
+    sigma = calibration.lens_projections_px["cam0"]
+    assert sigma is not None
+    short, longer, longest = (lens_words(calibration, width)[0] for width in (40, 100, 200))
+    assert short.startswith("cam0 lens: fx 458.65") and short.endswith(f" px, projection +- {format_number(sigma)} px")
+    assert longer == f"{short}, pinhole-radtan" and longest.startswith(f"{longer} k1 -0.28")
+    strict = dataclasses.replace(calibration, settings=calibration.settings | {"pixel_tolerance": 0.5 * sigma})
+    weak = tuple(
+        dataclasses.replace(g, verdict=("weak",) * len(g.verdict)) if g.name == "intrinsics" else g
+        for g in calibration.groups
+    )
+    assert lens_words(dataclasses.replace(strict, groups=weak), 40)[0] == f"{short}, weak"
+    fixed = tuple(
+        dataclasses.replace(g, columns=None, verdict=("fixed",) * len(g.verdict))
+        if g.name in ("intrinsics", "distortion")
+        else g
+        for g in calibration.groups
+    )
+    assert lens_words(dataclasses.replace(calibration, groups=fixed), 40)[0].endswith(" px, fixed")
 
 
 def test_outputs_are_one_set(calibration: Calibration, tmp_path: Path):

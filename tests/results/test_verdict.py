@@ -52,10 +52,10 @@ def cases(calibration: Calibration) -> dict[str, Calibration]:
     }
 
 
-def console_of(c: Calibration) -> str:
+def console_of(c: Calibration, verbose: bool = False) -> str:
     out = io.StringIO()
     with contextlib.redirect_stdout(out):
-        print_result(c, Path("out"))
+        print_result(c, Path("out"), verbose)
     return " ".join(out.getvalue().split())
 
 
@@ -63,10 +63,8 @@ def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Cal
     """And its legend says what the words of the table mean."""
     c = cases["not usable: wrong and open"]
     monkeypatch.setenv("LINES", "5")
-    shown = console_of(c)
-    assert shown.startswith(
-        f"Verdict: {c.verdict}. {NEXT[c.verdict]} First of {len(c.reasons)} reasons: {c.reasons[0]}"
-    )
+    shown = console_of(c, verbose=True)
+    assert shown.startswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]} Reason 1 of {len(c.reasons)}: {c.reasons[0]}")
     assert shown.endswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]}") and "bloom: dark edges" in shown
     monkeypatch.setenv("LINES", "500")
     assert console_of(c).startswith("Calibration")
@@ -188,7 +186,7 @@ def test_verdicts_without_weight_are_in_brackets(cases: dict[str, Calibration], 
         bracketed = {v for v in found if v.startswith("(")}
         assert (c.verdict == "usable" or bool(c.warnings)) or found - bracketed, name
         assert c.verdict != "usable" or found == bracketed, name
-        assert ("In brackets: without weight" in console_of(c)) == bool(bracketed), name
+        assert ("In brackets: without weight" in console_of(c, verbose=True)) == bool(bracketed), name
     assert {r.verdict for r in rows(cases["usable: prior"]) if r.name == "time offset"} == {"(weak)"}
     assert {r.verdict for r in rows(cases[lens]) if r.name == "fx"} == {"(weak)"}
 
@@ -220,17 +218,22 @@ def test_the_baseline_is_that_of_samples(calibration: Calibration):
     assert f"baseline {1e3 * r.distance:.2f} +- " in console_of(calibration)
 
 
-@pytest.mark.parametrize("quiet", [False, True])
+@pytest.mark.parametrize("flags", [[], ["-q"], ["-v"]])
 def test_the_exit_code_of_strict(
-    cases: dict[str, Calibration], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, quiet: bool
+    cases: dict[str, Calibration],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
 ):
-    """Without --strict 0, whatever the verdict; with it that of the verdict."""
+    """Without --strict 0, whatever the verdict; with it that of the verdict. The board's shape is printed by -v."""
     rig = tmp_path / "rig.yaml"
     rig.write_text((Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml").read_text())
     monkeypatch.setattr("icalib.export.outputs.write_outputs", lambda *_: None)
-    command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *(["-q"] if quiet else [])]
+    command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *flags]
     for name in ("usable", "usable with care: weak", "partly usable", "not usable: wrong"):
         monkeypatch.setattr("icalib.pipeline.calibrate", lambda *_, c=cases[name], **__: c)
         assert main(command) == 0
         assert main([*command, "--strict"]) == EXIT_CODES[cases[name].verdict]
+        assert ("shape bow xx" in capsys.readouterr().out) == (flags == ["-v"])
     assert list(EXIT_CODES.values()) == [0, 3, 4, 5]

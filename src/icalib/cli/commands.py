@@ -130,6 +130,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[CommandParser]) -> None:
     strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; default: 0 for every written result"
     c.add_argument("--strict", action="store_true", help=strict)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table; warnings go to stderr")
+    c.add_argument("--verbose", "-v", action="store_true", help="print single numbers of lenses, IMU and board, too")
     c.set_defaults(run=_calibrate)
 
 
@@ -247,7 +248,7 @@ def _calibrate(options: argparse.Namespace) -> int:
     if options.quiet:
         print_warnings(result)
     else:
-        print_result(result, options.output)
+        print_result(result, options.output, options.verbose)
     return EXIT_CODES[result.verdict] if options.strict else 0
 
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.text import Text
 
 from icalib.export.kalibr import kalibr_texts
-from icalib.report.console import bodies_words, relative_words, table
+from icalib.report.console import bodies_words, legend, lens_words, relative_words, shown_rows, table
 from icalib.result import Calibration
 from icalib.result.quantities import chi2_words, dof_words, rms_words
 from icalib.result.verdict import NEXT, Usability
@@ -67,55 +67,46 @@ def progress_lines(clock: Callable[[], float]) -> Callable[[str, float], None]:
     return show
 
 
-def print_result(calibration: Calibration, folder: Path) -> None:
-    """Prints the result on standard output: parameters, residual statistics, notes, written files, verdict."""
-    console, parameters = Console(), table(calibration)
-    if parameters.row_count > console.height:
-        _print_summary(calibration, console)
-    console.print(parameters)
-    if placed := bodies_words(calibration):
-        console.print(f"  target: {placed}", markup=False)
-    for sentence in relative_words(calibration):
-        console.print(f"  {sentence}", markup=False)
+def print_result(calibration: Calibration, folder: Path, verbose: bool = False) -> None:
+    """Prints the result on standard output: parameters, residual statistics, notes, written files, verdict. verbose:
+    all parameters, see `shown_rows`."""
+    console, entries = Console(markup=False), shown_rows(calibration, verbose)
+    if len(entries) > console.height:  # a long output begins with verdict and first reason
+        console.print(_verdict_line(calibration))
+        for sentence in calibration.reasons[:1]:
+            console.print(f"Reason 1 of {len(calibration.reasons)}: {sentence}", highlight=False)
+    console.print(table(entries))
+    lines = (*lens_words(calibration, console.width - 2), bodies_words(calibration), *relative_words(calibration))
+    for sentence in filter(None, lines):
+        console.print(f"  {sentence}")
+    console.print(legend(calibration, entries), highlight=False)
     if calibration.fits:
-        console.print(RESIDUALS, markup=False)
+        console.print(RESIDUALS)
     for f in calibration.fits:
         rms = f", {rms_words(f)} RMS" if f.rms is not None else ""
         rms += f", {f.rejected} rejected" if f.unit == "px" else ""
-        console.print(
-            f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}", markup=False
-        )
+        console.print(f"  {f.sensor} {f.kind}: chi^2 per degree of freedom {chi2_words(f)} ({dof_words(f)}){rms}")
     for sentence in calibration.notes:
-        console.print(f"Note: {sentence}", markup=False)
-    console.print(f"Solver: {calibration.status}", markup=False)
+        console.print(f"Note: {sentence}")
+    console.print(f"Solver: {calibration.status}")
     written = [*kalibr_texts(calibration), "report.html"]
     unfit = ", with the verdict that it is not usable" if calibration.verdict == "not usable" else ""
-    console.print(f"Wrote {folder / 'calibration.yaml'}{unfit}, {', '.join(written)}.", markup=False)
+    console.print(f"Wrote {folder / 'calibration.yaml'}{unfit}, {', '.join(written)}.")
     print_verdict(calibration, console)
-
-
-def _print_summary(calibration: Calibration, console: Console) -> None:
-    """Prints verdict and first reason before an output that is longer than the terminal."""
-    console.print(_verdict_line(calibration))
-    count = len(calibration.reasons)
-    for sentence in calibration.reasons[:1]:
-        first = "Reason" if count == 1 else f"First of {count} reasons"
-        console.print(f"{first}: {sentence}", markup=False, highlight=False)
 
 
 def print_verdict(calibration: Calibration, console: Console) -> None:
     """Prints the numbered reasons of the verdict, and as last line the verdict with advice."""
     for k, sentence in enumerate(calibration.reasons, 1):
-        console.print(f"Reason {k}: {sentence}", markup=False, highlight=False)
+        console.print(f"Reason {k}: {sentence}", highlight=False)
     console.print(_verdict_line(calibration))
 
 
-def _verdict_line(calibration: Calibration) -> Text:
-    verdict = calibration.verdict
-    return Text.assemble("Verdict: ", (verdict, VERDICT_STYLES[verdict]), f". {NEXT[verdict]}")
+def _verdict_line(c: Calibration) -> Text:
+    return Text.assemble("Verdict: ", (c.verdict, VERDICT_STYLES[c.verdict]), f". {NEXT[c.verdict]}")
 
 
 def print_warnings(calibration: Calibration) -> None:
     """Output of `--quiet` on standard error: reasons and verdict, or nothing if there are no reasons."""
     if calibration.reasons:
-        print_verdict(calibration, Console(stderr=True))
+        print_verdict(calibration, Console(stderr=True, markup=False))

@@ -35,6 +35,7 @@ class Row:
     the result, see `verdict.counted`, is in brackets."""
 
     sensor: str
+    group: str
     name: str
     value: str
     std: str
@@ -65,7 +66,7 @@ def rows(calibration: Calibration) -> list[Row]:
         if merged := [row for row, is_sharper in zip(group_rows, sharpened, strict=True) if not is_sharper]:
             verdict = worst(tuple(v for v, is_sharper in zip(group.verdict, sharpened, strict=True) if not is_sharper))
             words = _verdict_words(verdict, counted(calibration, group))
-            out.append(Row(group.sensor, f"{len(merged)} more intrinsics", "prior", "", "", "", "", words))
+            out.append(Row(group.sensor, group.name, f"{len(merged)} more intrinsics", "prior", "", "", "", "", words))
     return out
 
 
@@ -152,6 +153,7 @@ def _rows_of(group: ParameterGroup, counting: tuple[Verdict, ...]) -> list[Row]:
     return [
         Row(
             sensor=group.sensor,
+            group=group.name,
             name=names[i],
             value=_value_text(values[i], scale * group.std[i]),
             std="" if verdict == "fixed" else format_number(scale * group.std[i]),
@@ -168,9 +170,9 @@ def _angle_rows(c: Calibration, group: ParameterGroup) -> list[Row]:
     """Rows of roll, pitch and yaw of a rotation."""
     angles = zip(TURNS, *(x.tolist() for x in rpy_deg(group.value, joint_covariance(c, [group]))), strict=True)
     if group.columns is None:
-        return [Row(group.sensor, name, f"{angle:.6g}", "", "", "", "deg", "fixed") for name, angle, _ in angles]
+        return [Row(group.sensor, group.name, name, f"{x:.6g}", "", "", "", "deg", "fixed") for name, x, _ in angles]
     return [
-        Row(group.sensor, name, _value_text(angle, std), format_number(std), "", "", "deg", "")
+        Row(group.sensor, group.name, name, _value_text(angle, std), format_number(std), "", "", "deg", "")
         for name, angle, std in angles
     ]
 
