@@ -94,7 +94,7 @@ def no_match_error(imu: ImuData, name: str, rates: SensorRates) -> EstimationErr
         )
     return EstimationError(
         f"the motion of {name} does not match that of {imu.name} at any time offset; check that both come "
-        "from the same recording, overlap in time, and are in rad/s."
+        "from the same recording and overlap in time."
     )
 
 

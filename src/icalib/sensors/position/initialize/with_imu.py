@@ -134,10 +134,7 @@ def _contradicting(imu: ImuData, name: str, misfit: float, mirrored: bool) -> Es
             f"{sentence}, but does where east and north are swapped; correct the order of latitude and longitude, or "
             "of x and y, by `columns: [...]` in the rig file."
         )
-    return OtherMotionError(
-        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
-        "(accel_unit, gyro_unit)."
-    )
+    return OtherMotionError(f"{sentence}; check that both come from the same recording of one vehicle.")
 
 
 def _motionless(name: str, rms: float) -> EstimationError:
