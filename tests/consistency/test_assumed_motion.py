@@ -11,9 +11,10 @@ from scipy.stats import chi2
 from tests.consistency.test_robot import steady
 from tests.typed import not_none
 
-from icalib.data.measurements import Measurements
+from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
 from icalib.export.outputs import write_outputs
+from icalib.initialize.assumed_motion import _with_rate
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.result.verdict import UNUSABLE
@@ -255,3 +256,12 @@ def test_a_scale_that_no_measurement_shows_is_its_prior(robot, parts, seconds):
     columns = np.concatenate([not_none(g.columns) for g in sizes])
     errors = np.concatenate([g.value - simulation.truth.values["wheel0"][g.name] for g in sizes])
     assert errors @ np.linalg.solve(result.covariance[np.ix_(columns, columns)], errors) < chi2.ppf(0.999, 3)
+
+
+@pytest.mark.parametrize(("hz", "slow"), [(5.0, True), (20.0, False)])
+def test_the_rate_of_the_sensor_that_shows_the_motion_is_named(hz: float, slow: bool):
+    """Where another sensor does not match it. `assumed motion` is no sensor that a user knows."""
+    poses = PoseStream("mocap0", np.arange(20) * round(1e9 / hz), np.tile(np.eye(3), (20, 1, 1)), np.zeros((20, 3)))
+    words = _with_rate("the motion of cam0 does not match that of assumed motion at any time offset.", poses)
+    assert words.startswith(f"the motion of cam0 does not match that of mocap0 at {hz:g} Hz at any time offset.")
+    assert ("record at 20 Hz" in words) == slow

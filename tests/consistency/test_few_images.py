@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tests.typed import not_none
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
+from icalib.report.tables import size_words
 from icalib.result import Calibration
 from icalib.rig import Camera, PoseSensor, Rig, by_name
 from icalib.tools.simulation import handheld, rig_for, simulate
@@ -23,6 +25,11 @@ CAMERA, POSE_SENSOR = Camera("cam0", "", "pinhole-radtan", (752, 480)), PoseSens
 
 
 def stills(count: int, seed: int, shared_px: float) -> Calibration:
+    rig, stream = taken(count, seed, shared_px)
+    return calibrate_measurements(rig, Measurements.of_streams(stream))
+
+
+def taken(count: int, seed: int, shared_px: float) -> tuple[Rig, CornerStream]:
     """One camera alone, `count` images, corners with noise of 0.2 px and an error that those of an image share: linear
     and quadratic in the image, no pose makes up for it."""
     scenario = handheld(20.0)
@@ -39,8 +46,7 @@ def stills(count: int, seed: int, shared_px: float) -> Calibration:
     rig = rig_for(simulation.scenario, intrinsics="start", distortion="start")
     own = dataclasses.replace(rig.cameras[0], corner_noise_px=None)
     rig = rig.with_(imu=None, cameras=(own,), settings=dataclasses.replace(rig.settings, segments=8))
-    stream = CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
-    return calibrate_measurements(rig, Measurements.of_streams(stream))
+    return rig, CornerStream("cam0", whole.stamps_ns[kept], start, whole.point[rows], uv)
 
 
 def in_deviations(result: Calibration, formal: bool) -> list[float]:
@@ -75,6 +81,27 @@ def test_few_images_say_how_much_their_spread_can_tell():
     result = stills(6, 1, 0.1)
     assert any("5 parts" in n and "Student" in n and n.endswith("record more images.") for n in result.notes)
     assert not any("Student" in n for n in stills(40, 1, 0.1).notes)
+
+
+def test_pictures_without_a_clock_have_names_and_no_seconds():
+    """Of 40 the lens of the last 15 is longer by 3 %."""
+    rig, stream = taken(40, 1, 0.0)
+    numbers = np.arange(1, 41)
+    longer = np.where(stream.image[:, None] < 25, 1.0, 1.03)
+    stream = dataclasses.replace(
+        stream,
+        stamps_ns=numbers * 1_000_000_000,
+        uv=(stream.uv - LENS["intrinsics"][2:]) * longer + LENS["intrinsics"][2:],
+        files={int(k) * 1_000_000_000: f"{k:04d}.png" for k in numbers},
+    )
+    result = calibrate_measurements(rig, Measurements.of_streams(stream))
+    assert re.search(r"^cam0 changes near image 00(2\d).png: its lens", result.reasons[0]), result.reasons
+    sentences = " ".join([*result.reasons, *result.notes])
+    assert "--from" not in sentences and not re.search(r"\d s\b", sentences)
+    assert not result.rates and size_words(result).startswith("40 images")
+    several = calibrate_measurements(rig, [Measurements.of_streams(stream, name=name) for name in "ab"])
+    assert "recording 2, b: 40 images." in several.notes
+    assert size_words(several).startswith("2 recordings, 80 images")
 
 
 @pytest.mark.parametrize(

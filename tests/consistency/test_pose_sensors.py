@@ -188,7 +188,7 @@ def test_what_cannot_be_calibrated_is_said():
     sim = simulate(scenario, 1)
     rig, (stream,) = rig_for(scenario), sim.measurements.poses
     other = simulate(scenario, 2).measurements.poses[0]
-    with pytest.raises(EstimationError, match="mocap0 does not match that of imu0 at any time offset"):
+    with pytest.raises(EstimationError, match="mocap0 does not match that of imu0 at any time offset[^/]*$"):
         calibrate_measurements(rig, cut(sim, other))
     still = PoseStream("mocap0", stream.stamps_ns, np.tile(np.eye(3), (len(stream.stamps_ns), 1, 1)), stream.position)
     with pytest.raises(EstimationError, match="its rotation is the same in all poses"):

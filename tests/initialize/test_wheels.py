@@ -189,6 +189,19 @@ def test_swapped_wheels_turn_the_other_way_round():
         wheel_offset(imu_of(p), UP, "wheel0", wheel_rates("wheel0", seconds, angles[:, ::-1]))
 
 
+@pytest.mark.parametrize("turn", [0.6, 1.2])
+def test_a_wheel_that_sticks_is_not_swapped(turn):
+    """For 2.5 of 20 s. Yaw rates of the opposite sign then correlate more, at a shift with a shorter overlap."""
+    p = path(20.0, turn=turn)
+    seconds, angles = stamped(p, 1.0, first=1.0, last=19.0)
+    steps = np.diff(angles[:, 0])
+    held = np.abs(seconds[:-1] - 5.25) < 1.25
+    steps[held] = steps[held][0]
+    angles[1:, 0] = angles[0, 0] + np.cumsum(steps)
+    found = wheel_offset(imu_of(p), UP, "wheel0", wheel_rates("wheel0", seconds, angles))
+    assert found == pytest.approx(1.0, abs=0.1)
+
+
 def test_wheels_of_another_drive_match_at_no_shift():
     p = path()
     other = np.cumsum(np.random.default_rng(2).normal(size=(1700, 2)), axis=0) * 0.05

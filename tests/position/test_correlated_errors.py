@@ -78,6 +78,7 @@ def walking(seed, density, known=WALK, **fields):
 def advised(result):
     """The density that a warning on correlated residuals advises."""
     (warning,) = (w for w in result.warnings if "correlated" in w)
+    assert "the cause is unknown" in warning and "multipath" not in warning
     (density,) = re.findall(r"position_random_walk: ([0-9.]+[0-9])", warning)
     return float(density)
 

@@ -112,6 +112,13 @@ class Measurements:
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
         return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses, *self.wheels)[0]
 
+    @property
+    def has_clock(self) -> bool:
+        """False for pictures that are ordered by their numbers: their stamps are whole seconds, and no times."""
+        if self.imu is not None or not isinstance(stream := self.reference, CornerStream):
+            return True
+        return not any(stream.files.values()) or bool((stream.stamps_ns % 1_000_000_000).any())
+
     def unassociated(self) -> Measurements:
         """A copy in which the association of LiDAR points with planes is unknown."""
         return self.with_streams(*(x.unassociated() for x in self.lidars))

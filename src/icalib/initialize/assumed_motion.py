@@ -23,7 +23,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
 from icalib.estimate.problem.inputs import Inputs, inputs_for
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.assumed_sensors import assumed_imu, pose_streams, with_assumed_readings
+from icalib.initialize.assumed_sensors import ASSUMED_IMU, assumed_imu, pose_streams, with_assumed_readings
 from icalib.initialize.hosts_on_odometry import (
     body_poses_by,
     hosts_without_body,
@@ -50,7 +50,9 @@ from icalib.optim.state import State, in_recording
 from icalib.rig import Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.sensor import mounted
+from icalib.sensors.stream import Stream
 
+SLOW_HZ = 10.0  # rate of poses below which motion by hand may change direction between two of them
 ASSUMED_IMU_STEP_S = 0.01  # s between its readings
 DENSITY_LAG_S = 0.1  # s: lag over which changes of rate and acceleration are compared to estimate their densities
 MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): floor for a body at rest
@@ -73,6 +75,19 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
                 continue
             raise EstimationError(words) from error
         raise
+    except EstimationError as error:
+        if ASSUMED_IMU in str(error):
+            body = next(s for s in recordings[0].streams.values() if s.name == rig.reference)
+            error.args = (_with_rate(str(error), body),)
+        raise
+
+
+def _with_rate(sentence: str, body: Stream) -> str:
+    """The sentence of an error, with the sensor that shows the motion and its rate in place of the assumed IMU."""
+    rate = 1.0 / float(np.median(np.diff(body.seconds)))
+    slow = " That rate follows slow motion only: record at 20 Hz, move more slowly, or add an IMU."
+    advice = slow if rate < SLOW_HZ else ""
+    return sentence.replace(ASSUMED_IMU, f"{body.name} at {rate:.2g} Hz") + advice
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:

@@ -49,11 +49,17 @@ class Timeline:
         return np.searchsorted([p.begin for p in self.parts[1:]], seconds, side="right")
 
     def words(self, second: float) -> str:
-        """Text for an instant on the joined clock [s]: seconds since the start of its recording, and the recording's
-        name if there are several. The body sensor must have been running."""
-        k = int(self.recording_of(np.array(second)))
-        text = f"{second - self.parts[k].begin:.3f} s"
-        return text if len(self.parts) == 1 else f"{text} of {self.parts[k].name}"
+        """Text for an instant on the joined clock [s]: seconds since the start of its recording (the nearest image if
+        it has no clock), and the name of that if there are several. The body sensor must have been running."""
+        part = self.parts[int(self.recording_of(np.array(second)))]
+        m, since = part.measurements, second - part.begin
+        text = f"{since:.3f} s" if m.has_clock else f"image {m.cameras[0].nearest(since)}"
+        return text if len(self.parts) == 1 else f"{text} of {part.name}"
+
+    @property
+    def can_be_cut(self) -> bool:
+        """Whether --from and --to select a part: there is one recording, and it has a clock."""
+        return len(self.parts) == 1 and self.parts[0].measurements.has_clock
 
 
 def _extent(part: Part, image_times: Mapping[str, np.ndarray], body: str) -> tuple[float, float]:

@@ -123,9 +123,10 @@ def _notes(assessed: AssessedEstimate) -> Iterator[str]:
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:
-    """Rate [Hz] of each sensor, from the median interval of its stamps."""
+    """Rate [Hz] of each sensor, from the median interval of its stamps; none without a clock."""
     m = inputs.measurements
-    streams = (m.streams[name] for name in inputs.rig.sensors if name in m.streams)
+    timed = all(p.measurements.has_clock for p in inputs.parts)
+    streams = (m.streams[name] for name in inputs.rig.sensors if timed and name in m.streams)
     sensor_streams = (s for s in streams if len(s.stamps_ns) > 1 and not _is_assumed(inputs, s.name))
     return {s.name: float(1.0 / np.median(np.diff(s.seconds))) for s in sensor_streams}
 

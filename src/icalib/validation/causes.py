@@ -160,7 +160,7 @@ def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
     """A sentence on a disturbance at one time."""
     names = " and ".join(hit.sensors)
     part = "leave that part out"
-    if len(timeline.parts) == 1:
+    if timeline.can_be_cut:
         part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
     return (
         f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
@@ -217,9 +217,9 @@ def _clock_words(c: Change, others: list[str], segments: Segments, when: str, ti
 
 
 def _apart(c: Change, timeline: Timeline, words: str) -> str:
-    """`words`, with how to use one side of a step alone. Empty for a drift, and for several recordings. The step is
+    """`words`, with how to use one side of a step alone. Empty for a drift, and without --from and --to. The step is
     somewhere within the segments around `c.second`."""
-    if c.pattern == "drift" or len(timeline.parts) > 1:
+    if c.pattern == "drift" or not timeline.can_be_cut:
         return ""
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 

@@ -13,8 +13,9 @@ from icalib.sensors import call_all_kinds
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Notes on the recordings, then on each kind of sensor."""
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
-        number = f"recording {k}"
+        number, m = f"recording {k}", timeline.parts[k - 1].measurements
         name = number if span.name == number else f"{number}, {span.name}"
-        yield f"{name}: {span.end - span.start:.1f} s from {span.origin_ns} ns on."
+        timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
+        yield f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}."
     yield from inputs.measurements.notes
     yield from call_all_kinds("assess", "notes", inputs, estimate, timeline)

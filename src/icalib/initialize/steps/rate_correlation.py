@@ -195,11 +195,12 @@ MaskedSignal = tuple[np.ndarray, np.ndarray]  # values, and bool: which of them 
 
 class CorrelationPeak(NamedTuple):
     """Signal b(t) is most like a(t + samples). correlation: Pearson's coefficient at this shift; largest: at
-    any shift."""
+    any shift. score: Fisher's z (atanh of the correlation) times the root of the overlap in samples."""
 
     samples: int
     correlation: float
     largest: float
+    score: float
 
 
 def best_shift(a: MaskedSignal, b: MaskedSignal, least: float) -> CorrelationPeak:
@@ -213,8 +214,7 @@ def best_shifts(
     signal_a: MaskedSignal, signal_b: MaskedSignal, least: float, most: int, apart: int
 ) -> list[CorrelationPeak]:
     """At most `most` peaks, the best first, each more than `apart` samples from the better ones. See `best_shift`.
-    Peaks are ranked by Fisher's z (atanh of the correlation) times the root of the overlap, so that a long overlap
-    outweighs a short one."""
+    Peaks are ranked by their score, so that a long overlap outweighs a short one."""
     (a, mask_a), (b, mask_b) = signal_a, signal_b
     n = len(a) + len(b) - 1
     size = 1 << (n - 1).bit_length()
@@ -239,7 +239,7 @@ def best_shifts(
     peaks = []
     for _ in range(most):
         k = int(np.argmax(score))
-        peaks.append(CorrelationPeak(k - (len(b) - 1), float(r[k]), float(r.max())))
+        peaks.append(CorrelationPeak(k - (len(b) - 1), float(r[k]), float(r.max()), float(score[k])))
         score[max(k - apart, 0) : k + apart + 1] = -np.inf
         if not np.isfinite(score).any():
             break

@@ -82,6 +82,10 @@ class CornerStream(_ImageStream):
         """Text that names the image with this stamp in messages: its file, or else its stamp."""
         return which_image(self.files.get(stamp_ns, ""), stamp_ns)
 
+    def nearest(self, second: float) -> str:
+        """Text that names the image nearest to `second` after the first."""
+        return self.which(int(self.stamps_ns[np.argmin(np.abs(self.seconds - second))]))
+
     @property
     def relative_sigma(self) -> np.ndarray:
         """(N,) detector's standard deviation of each corner, over that of the median corner; ones if it states none."""

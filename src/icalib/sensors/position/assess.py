@@ -94,8 +94,8 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
         known = inputs.sensor(factor.name).position_random_walk
         advice = f"set position_random_walk: {np.hypot(known, density):.2g} in the rig file" if density else ""
         yield (
-            f"the residuals of {factor.name} are correlated ({correlation:.2f} from fix to fix), as by multipath or by "
-            "a receiver that filters. Its standard deviations may be 1.3 times too small; "
+            f"the residuals of {factor.name} are correlated ({correlation:.2f} from fix to fix); the cause is unknown. "
+            "Its standard deviations may be 1.3 times too small; "
             f"{advice or 'leave out worse fixes with least_status'}."
         )
 

@@ -14,8 +14,8 @@ from icalib.result import Calibration, RowResiduals
 OUTLIER_SIGMA = 3.0  # standard deviations: white noise exceeds it in 1 of 34 fixes (chi, three degrees of freedom)
 MAX_PATH_POINTS = 4000  # of a trajectory in a figure
 _WORDS = (
-    "Along x, y and z of the sensor's frame: east, north and up of GNSS. They should look like noise; waves are errors "
-    "that last, as of multipath, and steps are changes of the solution."
+    "Along x, y and z of the sensor's frame: east, north and up of GNSS. They should look like noise; waves and steps "
+    "are errors that last."
 )
 _MAP = (
     "The path of each antenna from above, and where its fixes are more than three standard deviations off. If they are "

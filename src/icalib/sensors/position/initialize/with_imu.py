@@ -158,10 +158,7 @@ def _check_misfit(imu: ImuData, name: str, fix: Fix, misfit: float, mirrored: bo
             f"{name}: its fixes are motionless or move evenly, beside noise of {fix.noise:.2g} m; record again while "
             "speeding up, braking and turning."
         )
-    raise OtherMotionError(
-        f"{sentence}; check that both are on the same vehicle, and units and axes of {imu.name} "
-        "(accel_unit, gyro_unit)."
-    )
+    raise OtherMotionError(f"{sentence}; check that both come from the same recording of one vehicle.")
 
 
 def _fit_at_offset(

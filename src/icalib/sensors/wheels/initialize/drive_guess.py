@@ -28,6 +28,7 @@ from icalib.rig import WheelKind, drive_names
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
 MIN_OVERLAP_S = 4.0  # of IMU and wheel readings; shorter overlaps correlate by chance
 MIN_CORRELATION = 0.7  # of matching yaw rates: half of the variance; unrelated recordings stay far below
+CLEARLY = 1.2  # ratio of scores of opposite yaw rates; a wheel that sticks for a while gives 1.1
 RATE_WINDOW_S = 0.1  # over which rates of the wheels are averaged: many ticks of an encoder
 MIN_WINDOWS = 20  # several for each of the at most five unknowns
 MIN_YAW_RATE_RAD_S = 0.03  # RMS; less is noise of the estimated motion
@@ -362,7 +363,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     best, opposite = (
         best_shift((sign * turned, known), (turning, covered), MIN_OVERLAP_S * CORRELATION_HZ) for sign in (1.0, -1.0)
     )
-    if opposite.correlation > max(best.correlation, MIN_CORRELATION):
+    if opposite.correlation > MIN_CORRELATION and opposite.score > CLEARLY * best.score:
         raise EstimationError(f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}.")
     if not best.correlation > MIN_CORRELATION:
         if np.std(turned[known]) < MIN_RATE_VARIATION * abs(np.mean(turned[known])):

@@ -128,7 +128,7 @@ def _rough(
         raise EstimationError(
             f"the motion of {stream.name} does not match that of {imu.name} at any time offset and focal "
             f"length ({unexplained:.0%} of the angular rate is unexplained). Check that both come from the "
-            "same recording, overlap in time, and are in rad/s, or give intrinsics in the rig file."
+            "same recording and overlap in time, or give intrinsics in the rig file."
         )
     return _Fit(lens, aligned)
 
