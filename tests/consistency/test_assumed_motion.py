@@ -264,4 +264,4 @@ def test_the_rate_of_the_sensor_that_shows_the_motion_is_named(hz: float, slow: 
     poses = PoseStream("mocap0", np.arange(20) * round(1e9 / hz), np.tile(np.eye(3), (20, 1, 1)), np.zeros((20, 3)))
     words = _with_rate("the motion of cam0 does not match that of assumed motion at any time offset.", poses)
     assert words.startswith(f"the motion of cam0 does not match that of mocap0 at {hz:g} Hz at any time offset.")
-    assert ("record at 20 Hz" in words) == slow
+    assert ("Record at 20 Hz" in words) == slow

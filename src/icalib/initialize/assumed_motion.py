@@ -85,8 +85,7 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
 def _with_rate(sentence: str, body: Stream) -> str:
     """The sentence of an error, with the sensor that shows the motion and its rate in place of the assumed IMU."""
     rate = 1.0 / float(np.median(np.diff(body.seconds)))
-    slow = " That rate follows slow motion only: record at 20 Hz, move more slowly, or add an IMU."
-    advice = slow if rate < SLOW_HZ else ""
+    advice = " Record at 20 Hz, move more slowly, or add an IMU." if rate < SLOW_HZ else ""
     return sentence.replace(ASSUMED_IMU, f"{body.name} at {rate:.2g} Hz") + advice
 
 

@@ -161,7 +161,5 @@ def size_words(c: Calibration) -> str:
     duration = float(np.ptp(c.trajectory.seconds)) if len(c.trajectory.seconds) else 0.0
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else duration
-    duration_words = f"{span:.1f} s, " if c.rates else ""  # pictures have no clock
-    return f"{several}{duration_words}" + ", ".join(
-        [*call_all_kinds("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"]
-    )
+    several += f"{span:.1f} s, " if c.rates else ""  # pictures have no clock
+    return several + ", ".join([*call_all_kinds("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])

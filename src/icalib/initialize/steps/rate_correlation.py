@@ -77,8 +77,7 @@ def likely_offsets(imu: ImuData, name: str, rates: SensorRates) -> list[float]:
     if not peaks[0].correlation > rates.least_correlation:
         raise EstimationError(
             f"the motion of {name} does not match that of {imu.name} at any time offset "
-            f"({correlation_in_words(peaks[0].largest)}); check that both come from the same recording and overlap "
-            "in time."
+            f"({correlation_in_words(peaks[0].largest)}); check that both are of one recording and overlap in time."
         )
     return [p.samples / CORRELATION_GRID_HZ for p in peaks if p.correlation > rates.least_correlation]
 
