@@ -22,6 +22,7 @@ from icalib.data.tables.table import read_bytes
 from icalib.errors import RecordingError, RigError
 from icalib.sensors.position.read.rtklib import read_pos
 from icalib.tools.inspection import read_target
+from icalib.tools.inspection.kalibr import yaml_mapping
 
 COMMANDS = {
     "simulate": ("simulate", "{}", "-o", "made"),
@@ -99,6 +100,12 @@ def test_aliases_are_counted_as_written_out(tmp_path: Path):
     (tmp_path / "april.yaml").write_text(f"{LAUGHS}target_type: *m\n")
     with pytest.raises(RigError, match="its aliases"):
         read_target(tmp_path / "april.yaml")
+
+
+@pytest.mark.parametrize("value", ['!!int ""', '!!float ""', "!!bool x", "!!timestamp x", "!!binary é", "{[1]: 2}"])
+def test_tags_of_a_kalibr_file_that_fit_no_value(value: str, tmp_path: Path):
+    (tmp_path / "imu.yaml").write_text(f"update_rate: {value}\n")
+    assert yaml_mapping(tmp_path / "imu.yaml") == {}
 
 
 def test_a_yaml_file_has_a_largest_size(tmp_path: Path):

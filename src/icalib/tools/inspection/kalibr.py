@@ -131,8 +131,8 @@ def yaml_mapping(path: Path) -> dict[str, Any]:
     """The mapping in a YAML file; empty if the file cannot be parsed or is no mapping."""
     try:
         data = yaml.SafeLoader("").construct_document(read_yaml(path).node)
-    except (RigError, ValueError, yaml.YAMLError, RecursionError):
-        return {}
+    except (RigError, ValueError, LookupError, AttributeError, yaml.YAMLError, RecursionError):
+        return {}  # the loader also fails on tags that do not fit their values, such as !!int of an empty text
     return data if isinstance(data, dict) else {}
 
 
