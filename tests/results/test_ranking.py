@@ -37,6 +37,9 @@ def test_noise_is_white_and_constant():
     white = rng.normal(size=(400, 2))
     assert are_noise(white) and are_noise(7.0 * white)
     assert not are_noise(np.cumsum(white, axis=0)), "a walk"
+    waves = np.sin(0.05 * np.arange(400))[:, None]
+    assert not are_noise(white + 0.6 * waves), "a slow error far below the noise"
+    assert not are_noise(np.diff(white, axis=0)), "steps of a noisy position"
     assert not are_noise(white * np.where(np.arange(400) < 50, 5.0, 1.0)[:, None]), "one part is noisier"
     assert not are_noise(np.zeros((400, 2))) and not are_noise(white[:10])
 

@@ -19,8 +19,8 @@ from icalib.validation.causes import INERTIAL, Misfit, noise_words, unknown_word
 
 LARGE_FACTOR = 3.0  # empirical factor; a warning above it
 CLEARLY = 1.5  # ratio of noise densities, from which on one is clearly larger
-N_LAGS = 3  # lags of the autocorrelation
-MAX_CORRELATION = 0.25  # autocorrelation of residuals that still counts as white
+BLOCKS = (3, 10, 30, 100)  # successive rows whose means are compared with those of white noise
+MAX_COLOUR = 2.5  # variance of means over that of white noise, or its inverse, that still counts as white
 CHANCE_SIGMAS = 3.0  # standard deviations that statistics may be off by chance
 N_NOISE_SEGMENTS = 8  # segments of the recording whose mean squares are compared
 MAX_VARIATION = 3.0  # mean square of a segment over that of the recording, or its inverse
@@ -114,12 +114,16 @@ def _is_noise(estimate: Estimate, f: SensorFit) -> bool:
 
 def are_noise(rows: np.ndarray) -> bool:
     """Whether residuals, rows (n, m), are white and of constant variance. The fit must have taken few of their degrees
-    of freedom."""
+    of freedom. The mean of n white numbers has a variance n times smaller."""
     n, square = len(rows), float(np.vdot(rows, rows))  # `vdot` needs no copy of many rows
     if n < 2 * N_NOISE_SEGMENTS or square == 0.0:
         return False
-    lags = [float(np.vdot(rows[lag:], rows[:-lag])) / square for lag in range(1, N_LAGS + 1)]
-    white = abs(np.mean(lags)) < max(MAX_CORRELATION, CHANCE_SIGMAS / np.sqrt(N_LAGS * rows.size))
+    white = True
+    for length in (b for b in BLOCKS if n >= N_NOISE_SEGMENTS * b):
+        means = rows[: n // length * length].reshape(n // length, length, -1).mean(axis=1)
+        colour = length * float((means**2).mean()) / (square / rows.size)
+        allowed = MAX_COLOUR + CHANCE_SIGMAS * np.sqrt(2.0 / means.size)
+        white &= 1.0 / allowed < colour < allowed
     sizes = [
         float(np.vdot(segment, segment)) / segment.size / (square / rows.size)
         for segment in np.array_split(rows, N_NOISE_SEGMENTS)
