@@ -67,15 +67,14 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
     """
     try:
         return _guess(rig, recordings)
-    except MotionContradictedError as error:
-        for words, converted in motion_kinds(rig)[0].rewritten(rig, recordings):
+    except EstimationError as error:
+        rewritten = motion_kinds(rig)[0].rewritten if isinstance(error, MotionContradictedError) else None
+        for words, converted in rewritten(rig, recordings) if rewritten else ():
             try:
                 _guess(rig, converted)
             except EstimationError:
                 continue
             raise EstimationError(words) from error
-        raise
-    except EstimationError as error:
         if ASSUMED_IMU in str(error):
             body = next(s for s in recordings[0].streams.values() if s.name == rig.reference)
             error.args = (_with_rate(str(error), body),)
@@ -86,7 +85,7 @@ def _with_rate(sentence: str, body: Stream) -> str:
     """The sentence of an error, with the sensor that shows the motion and its rate in place of the assumed IMU."""
     rate = 1.0 / float(np.median(np.diff(body.seconds)))
     advice = " Record at 20 Hz, move more slowly, or add an IMU." if rate < SLOW_HZ else ""
-    return sentence.replace(ASSUMED_IMU, f"{body.name} at {rate:.2g} Hz") + advice
+    return sentence.replace(ASSUMED_IMU, f"{body.name} at {rate:.3g} Hz") + advice
 
 
 def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:

@@ -85,7 +85,8 @@ def _trajectory(
     try:
         return kind, source_inputs, kind.trajectory(source_inputs, fallback)
     except EstimationError as error:
-        if source_inputs.rig.has_target or not (fallbacks or inputs.rig.wheels):
+        can_do_without = inputs.rig.wheels and not any(s.needs_imu for s in inputs.rig.mounted)
+        if source_inputs.rig.has_target or not (fallbacks or can_do_without):
             raise
         if not fallbacks:
             return _on_assumed_motion(inputs, recordings, error)

@@ -382,11 +382,11 @@ def _check_scale(imu: ImuData, name: str, rates: SensorRates, alignment: RateAli
 
 def _rate_ratio(alignment: RateAlignment, gyro: np.ndarray, camera: np.ndarray) -> float:
     """Rate of the gyroscope over that of the sensor, both (n, 3) about their medians, which hold the bias. The sensor's
-    rate is projected on the gyroscope's, so that its noise averages out, where that is faster than its RMS, see
-    `_unexplained`. 1 if the rates do not correlate."""
+    rate is projected on the gyroscope's, so that its noise averages out, in the faster half of the means in which the
+    vehicle turns, see `_unexplained`. 1 if the rates do not correlate."""
     gyro, camera = gyro - np.median(gyro, axis=0), (camera - np.median(camera, axis=0)) @ alignment.rotation.T
     size = np.linalg.norm(gyro, axis=1)
-    fast = size >= np.sqrt((size**2).mean())
+    fast = size >= max(np.median(size), MIN_TURN_RATIO * np.sqrt((size**2).mean()))
     along = np.median(np.einsum("na,na->n", gyro, camera)[fast] / size[fast])
     alike = along > MIN_COMMON_RATE_SHARE * np.median(np.linalg.norm(camera[fast], axis=1))
     return float(np.median(size[fast]) / along) if alike else 1.0

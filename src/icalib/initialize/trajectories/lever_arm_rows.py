@@ -166,17 +166,25 @@ def solve_lever_arm(
 def unexplained_displacement(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> float:
     """Median residual of the solution R_is, x (m,) over the median motion of the IMU in the equations. The motion of
     the sensor is no measure: inverted poses of a robot that turns in place move far, and any lever arm explains it."""
-    A, b, motion = rows(R_is, x[3:6])
-    residual = b - A[:, :, 3:] @ x[3:]
-    of_imu = motion - b + A[:, :, 6:] @ x[6:]  # without gravity and bias
-    return float(np.median(np.linalg.norm(residual, axis=1)) / max(np.median(np.linalg.norm(of_imu, axis=1)), 1e-30))
+    residual, _, of_imu = _median_sizes(rows, R_is, x)
+    return residual / of_imu
 
 
 def is_mirrored(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> bool:
     """Whether the sensor moved opposite to the solution R_is, x (m,). Rates in left-handed axes equal those in axes
     rotated by 180 deg, so such rates fit. Displacements then have the wrong sign, and the residual is about twice as
-    large as the displacements."""
-    return unexplained_displacement(rows, R_is, x) > MIN_MIRRORED_SHARE
+    large as the displacements, by IMU and by sensor."""
+    residual, of_sensor, of_imu = _median_sizes(rows, R_is, x)
+    return residual > MIN_MIRRORED_SHARE * max(of_sensor, of_imu)
+
+
+def _median_sizes(rows: LeverArmSystem, R_is: np.ndarray, x: np.ndarray) -> tuple[float, float, float]:
+    """Median sizes of the residuals of R_is, x (m,), and of the motion of sensor and IMU in the equations [m]."""
+    A, b, motion = rows(R_is, x[3:6])
+    inertial = motion - b + A[:, :, 6:] @ x[6:]  # without gravity and bias
+    vectors = (b - A[:, :, 3:] @ x[3:], motion, inertial)
+    residual, of_sensor, of_imu = (float(np.median(np.linalg.norm(v, axis=1))) for v in vectors)
+    return residual, of_sensor, max(of_imu, 1e-30)
 
 
 def _misfit_of_rotation(rows: LeverArmRows, prior: GaussianPrior) -> float:

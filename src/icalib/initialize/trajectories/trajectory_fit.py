@@ -35,6 +35,7 @@ from icalib.initialize.trajectories.lever_arm_rows import (
     SINGLE_AXIS_RATE_RATIO,
     UNKNOWN_SIGMA,
     VELOCITY_CHANGE_SIGMA_M_S,
+    is_mirrored,
     lever_arm_prior,
     solve_lever_arm,
     system_from_readings,
@@ -50,7 +51,8 @@ TRAJECTORY_GRAVITY_TOLERANCE = 0.1  # relative error of gravity: more means wron
 @dataclass(frozen=True)
 class TrajectoryFit:
     """guess: extrinsics of the sensor; motion: trajectory of the IMU; gravity: its estimated magnitude [m/s^2];
-    R_world_map (3, 3): levels the map, whose origin is that of the world; unexplained: see `unexplained_displacement`.
+    R_world_map (3, 3): levels the map, whose origin is that of the world; unexplained: see `unexplained_displacement`;
+    mirrored: see `is_mirrored`.
     """
 
     guess: ExtrinsicsGuess
@@ -58,6 +60,7 @@ class TrajectoryFit:
     gravity: float
     R_world_map: np.ndarray
     unexplained: float
+    mirrored: bool
 
 
 def fit_imu_trajectory(
@@ -90,8 +93,8 @@ def fit_imu_trajectory(
     start = ImuTrajectory(gyro, t, R_world_map @ R_map_imu, position, velocity, aligned.gyro_bias, x[9:12], gravity)
     rotation_observable = only_axis(rates.rate, SINGLE_AXIS_RATE_RATIO) is None
     guess = ExtrinsicsGuess(R_is, x[3:6], aligned.offset, rotation_observable)
-    unexplained = unexplained_displacement(system, R_is, x)
-    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), R_world_map, unexplained)
+    unexplained, mirrored = unexplained_displacement(system, R_is, x), is_mirrored(system, R_is, x)
+    return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), R_world_map, unexplained, mirrored)
 
 
 def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:

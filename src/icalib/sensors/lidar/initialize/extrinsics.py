@@ -19,7 +19,6 @@ from icalib.initialize.steps.single_recording import NOTHING_KNOWN, KnownExtrins
 from icalib.initialize.trajectories.imu_trajectory import MAX_PROPAGATION_S, ImuTrajectory
 from icalib.initialize.trajectories.lever_arm_rows import (
     DISPLACEMENT_SIGMA_M,
-    MIN_MIRRORED_SHARE,
     SINGLE_AXIS_RATE_RATIO,
     is_mirrored,
     lever_arm_prior,
@@ -53,7 +52,7 @@ def lidar_and_motion(
     fit = fit_imu_trajectory(imu, trajectory, rates, aligned, gravity, extrinsics)
     if fit is None:
         raise _too_short(stream)
-    _check_axes(stream.name, imu.name, fit.unexplained > MIN_MIRRORED_SHARE)
+    _check_axes(stream.name, imu.name, fit.mirrored)
     _check_gravity(fit.gravity, gravity, imu.name, stream.name)
     return fit.guess, fit.motion
 

@@ -366,7 +366,9 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     # Rates that repeat themselves match with either sign at some shift; reversed ones match without a larger shift.
     alone = best.correlation <= MIN_CORRELATION or abs(opposite.samples) <= abs(best.samples)
     if alone and opposite.correlation > MIN_CORRELATION and opposite.score > CLEARLY * best.score:
-        raise EstimationError(f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}.")
+        raise MotionContradictedError(
+            f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}."
+        )
     if not best.correlation > MIN_CORRELATION:
         if np.std(turned[known]) < MIN_RATE_VARIATION * abs(np.mean(turned[known])):
             raise EstimationError(
