@@ -120,10 +120,10 @@ def test_a_table_that_unpacks_to_too_much(tmp_path: Path):
     path = tmp_path / "gnss.pos.gz"
     path.write_bytes(gzip.compress(bytes(2 * FREE_BYTES)))
     with pytest.raises(RecordingError, match=r"unpacks to more than 16 MiB and 256 times its size; unpack it"):
-        read_pos(path)
+        read_pos("gnss0", path)
     path.write_bytes(gzip.compress(b"% GPST\n" * 9)[:-12])
     with pytest.raises(RecordingError, match="is a damaged or truncated gzip file"):
-        read_pos(path)
+        read_pos("gnss0", path)
 
 
 def png(width: int, height: int, size: int | None = None) -> bytes:

@@ -24,10 +24,12 @@ NAMING = {
     "data/measurements.py",  # shorthand, for users
     "detection/primitives/corners.py",  # the stream of the corners of images, for users
     "initialize/assumed_sensors.py",  # they are an IMU and a pose sensor
+    "initialize/rig_guess.py",  # wheels that show the motion in place of the IMU
     "motion/imu_data.py",  # readings of the IMU, which link keyframes
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
+    "result/timeline.py",  # names of pictures in place of seconds
     "tools/allan/analysis.py",  # the noise of IMUs
     "tools/simulation/images/filming.py",
     "tools/simulation/rigs.py",
@@ -41,6 +43,8 @@ NAMING = {
     "tools/simulation/sensors/tracks.py",
     "tools/simulation/tables.py",
     "tools/simulation/writing.py",
+    "validation/causes.py",  # checks that were made for the sensors of the rig
+    "validation/misfit.py",  # noise of the IMU
 }
 
 

@@ -28,7 +28,6 @@ from icalib.rig import WheelKind, drive_names
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
 MIN_OVERLAP_S = 4.0  # of IMU and wheel readings; shorter overlaps correlate by chance
 MIN_CORRELATION = 0.7  # of matching yaw rates: half of the variance; unrelated recordings stay far below
-CLEARLY = 1.2  # ratio of scores of opposite yaw rates; a wheel that sticks for a while gives 1.1
 RATE_WINDOW_S = 0.1  # over which rates of the wheels are averaged: many ticks of an encoder
 MIN_WINDOWS = 20  # several for each of the at most five unknowns
 MIN_YAW_RATE_RAD_S = 0.03  # RMS; less is noise of the estimated motion
@@ -365,7 +364,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     )
     # Rates that repeat themselves match with either sign at some shift; reversed ones match without a larger shift.
     alone = best.correlation <= MIN_CORRELATION or abs(opposite.samples) <= abs(best.samples)
-    if alone and opposite.correlation > MIN_CORRELATION and opposite.score > CLEARLY * best.score:
+    if alone and opposite.correlation > MIN_CORRELATION and opposite.score > best.score:
         raise MotionContradictedError(
             f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}."
         )
