@@ -29,6 +29,7 @@ CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
 MIN_OVERLAP_S = 4.0  # of IMU and wheel readings; shorter overlaps correlate by chance
 MIN_CORRELATION = 0.7  # of matching yaw rates: half of the variance; unrelated recordings stay far below
 RATE_WINDOW_S = 0.1  # over which rates of the wheels are averaged: many ticks of an encoder
+SAME_OVERLAP = 0.9  # share of samples that overlap, from which on two matches are of as many
 MIN_WINDOWS = 20  # several for each of the at most five unknowns
 MIN_YAW_RATE_RAD_S = 0.03  # RMS; less is noise of the estimated motion
 MIN_SPEED_M_S = 0.05  # RMS; less is noise of the estimated motion
@@ -362,8 +363,9 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     best, opposite = (
         best_shift((sign * turned, known), (turning, covered), MIN_OVERLAP_S * CORRELATION_HZ) for sign in (1.0, -1.0)
     )
-    # Rates that repeat themselves match with either sign at some shift; reversed ones match without a larger shift.
-    alone = best.correlation <= MIN_CORRELATION or abs(opposite.samples) <= abs(best.samples)
+    # Rates that repeat themselves match with either sign where few of them overlap; reversed ones match as many.
+    most, least = (min(len(wheels), len(grid) - p.samples) - max(0, -p.samples) for p in (best, opposite))
+    alone = best.correlation <= MIN_CORRELATION or least >= SAME_OVERLAP * most
     if alone and opposite.correlation > MIN_CORRELATION and opposite.score > best.score:
         raise MotionContradictedError(
             f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}."
