@@ -34,12 +34,6 @@ EXPLAINS = 0.1
 CHANGES = 0.25
 ALIKE = 0.8  # share of the best gain from which on another change explains the data as well
 LARGE = 2.0  # tolerances; a constant value is wrong by half of a change
-_MOUNT = "Fasten all mounts."
-_AGAINST = {
-    "intrinsics": "Switch off autofocus, zoom and image stabilisation.",
-    "rotation": _MOUNT,
-    "translation": _MOUNT,
-}
 INERTIAL = ("gyroscope", "accelerometer")
 
 
@@ -175,9 +169,9 @@ def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.name == TIME_OFFSET.name:
         return _clock_words(best, others, segments, when, timeline)
-    what = " or ".join(_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name)
-    against = (_AGAINST.get(c.name, "Check tyres, load and encoders.") for c in alike if c.name != TIME_OFFSET.name)
-    advice = " ".join(dict.fromkeys(against))
+    changed = [_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
+    what = " or ".join(size for size, _ in changed)
+    advice = " ".join(dict.fromkeys(against for _, against in changed))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
     return (
         f"{_names(best)} changes {when}: {what}{instead}. {advice} Record again"
@@ -189,15 +183,17 @@ def _names(c: Change) -> str:
     return " and ".join(c.sensors)
 
 
-def _changed(c: Change, segments: Segments) -> str:
-    """Text with the size of a change of a lens or of extrinsics."""
+def _changed(c: Change, segments: Segments) -> tuple[str, str]:
+    """Texts with the size of a change of a lens, of wheels or of extrinsics, and what to do against it."""
     if c.name == "intrinsics":
-        return f"its lens by up to {np.abs(c.value).max():.2g} px"
+        size = f"its lens by up to {np.abs(c.value).max():.2g} px"
+        return size, "Switch off autofocus, zoom and image stabilisation."
     if c.name not in ("rotation", "translation"):
         value = segments.state.values[c.sensors[0], c.name]
-        return f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
+        size = f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
+        return size, "Check tyres, load and encoders."
     turn, move = _sizes(segments, c)
-    return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
+    return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm", "Fasten all mounts."
 
 
 def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> str:

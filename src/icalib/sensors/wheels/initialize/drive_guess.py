@@ -59,6 +59,10 @@ REVERSED_YAW: dict[WheelKind, str] = {
 }
 
 
+class ReversedYawError(MotionContradictedError):
+    """Wheels turn in the opposite direction to the body; also if its vertical is taken for the opposite one."""
+
+
 @dataclass(frozen=True)
 class WheelRates:
     """Mean rates over n windows from start (n,) to end (n,) [s] on the wheels' clock.
@@ -367,9 +371,7 @@ def _correlate(imu: ImuData, turn: np.ndarray, name: str, rates: WheelRates) -> 
     most, least = (min(len(wheels), len(grid) - p.samples) - max(0, -p.samples) for p in (best, opposite))
     alone = best.correlation <= MIN_CORRELATION or least >= SAME_OVERLAP * most
     if alone and opposite.correlation > MIN_CORRELATION and opposite.score > best.score:
-        raise MotionContradictedError(
-            f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}."
-        )
+        raise ReversedYawError(f"{name} turns in the opposite direction to {imu.name}: {REVERSED_YAW[rates.kind]}.")
     if not best.correlation > MIN_CORRELATION:
         if np.std(turned[known]) < MIN_RATE_VARIATION * abs(np.mean(turned[known])):
             raise EstimationError(

@@ -12,7 +12,6 @@ from icalib.errors import EstimationError
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs
 from icalib.initialize.steps.contradicted_guesses import (
-    MotionContradictedError,
     has_guesses,
     is_contradicted,
     merged_values,
@@ -29,6 +28,7 @@ from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive_guess import (
     REVERSED_YAW,
+    ReversedYawError,
     WheelRates,
     drive_guess,
     wheel_offset,
@@ -122,8 +122,8 @@ def _from_trajectory(
             f"{wheels.name}: {REVERSED_YAW[rates.kind]}. If z of the frame of {up.level_sensor} points down, write "
             f"level: false for {up.level_sensor} instead."
         )
-    # A contradicted motion is the cause; an error of reversed yaw with the opposite vertical only follows from it.
-    raise next((error for error in (*failed, other) if isinstance(error, MotionContradictedError)), failed[0])
+    # The yaw is reversed with the wrong vertical; the cause is what fails with the other.
+    raise next((error for error in (*failed, other) if not isinstance(error, ReversedYawError)), failed[0])
 
 
 def _attempt(
