@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import LidarStream
+from icalib.detection.planes import count_directions, normal_shares
 from icalib.errors import EstimationError
 from icalib.sensors.lidar.initialize.odometry import lidar_trajectory, sampled_scans
 from icalib.sensors.lidar.initialize.voxel_map import (
-    count_directions,
     explaining_degeneracy,
     n_directions,
-    normal_shares,
 )
 
 

@@ -168,7 +168,7 @@ def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: s
     assert m is not None
     np.testing.assert_allclose(drawn[0]["z"], m.sigma, rtol=1e-4)
     assert drawn[0]["zmax"] <= 6.0 * m.median_seen and drawn[0]["contours"]["size"] <= drawn[0]["zmax"] / 9
-    assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_DOTS
+    assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_RESIDUAL_DOTS
     size, u, v = m.worst
     assert (
         f"Known to {format_number(m.median_seen)} px where it saw points (median), to {format_number(size)} px"
@@ -193,7 +193,7 @@ def test_a_fixed_lens_has_no_map_but_a_sentence(calibration: Calibration):
 def test_what_is_said_of_an_edge_without_data(seen: bool, sentence: str):
     sigma, cells = np.array([[0.1, 0.1, 0.9]]), np.array([[seen, seen, False]])
     m = ProjectionMap("cam0", np.inf, np.array([0.0, 10.0, 20.0]), np.zeros(1), sigma, cells)
-    found = projection_figures.words(m)
+    found = projection_figures.map_words(m)
     assert sentence in found and "0.10 px" in found and "0.90 px at the worst, at pixel (20, 0)" in found
     assert ("Let it see" in found) == seen
 

@@ -20,7 +20,7 @@ EVERY_S = 0.2  # least interval between updates in a notebook
 def progress_bar() -> Iterator[Callable[[str, float], None]]:
     """Yields the argument `progress` of `icalib.calibrate`: `with icalib.progress_bar() as progress: ...`."""
     if not in_notebook():
-        with console.progress_bar(quiet=False) as show:
+        with console.console_progress(quiet=False) as show:
             yield show
         return
     display: Any = import_module("IPython.display")

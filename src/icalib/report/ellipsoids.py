@@ -49,7 +49,7 @@ def magnification(c: Calibration) -> float:
     ]
     if not 0.0 < max(reference_sizes) < np.inf:
         return 1.0
-    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread(c) / max(reference_sizes)))))
+    return max(1.0, 10.0 ** float(np.floor(np.log10(_LARGEST * rig_shapes.spread_of(c) / max(reference_sizes)))))
 
 
 def outline(e: Ellipsoid, factor: float) -> np.ndarray:

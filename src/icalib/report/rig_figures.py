@@ -15,7 +15,7 @@ from icalib.result import Calibration
 
 def rig_picture(c: Calibration) -> Figure:
     """Axes and shapes of all sensors in the imu frame [m], with magnified ellipsoids of their position uncertainty."""
-    frames, spread = rig_shapes.frames(c), rig_shapes.spread(c)
+    frames, spread = rig_shapes.frames_of(c), rig_shapes.spread_of(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
     traces = [
         path_3d(
@@ -23,7 +23,7 @@ def rig_picture(c: Calibration) -> Figure:
         )
         for i in range(3)
     ]
-    shapes = [(name, pen) for name in c.mounted if (pen := rig_shapes.shape(c, name)) is not None]
+    shapes = [(name, pen) for name in c.mounted if (pen := rig_shapes.shape_of(c, name)) is not None]
     for i, (name, pen) in enumerate(shapes):
         color, T = COLORS[i % len(COLORS)], frames[name]
         traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))

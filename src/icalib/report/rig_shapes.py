@@ -14,21 +14,21 @@ CIRCLE = np.stack([np.cos(_ROUND), np.sin(_ROUND)], axis=1)
 _LEAST_SPREAD_M = 0.02
 
 
-def frames(c: Calibration) -> dict[str, np.ndarray]:
+def frames_of(c: Calibration) -> dict[str, np.ndarray]:
     """T_imu_sensor (4, 4) of the reference (identity) and of each mounted sensor, by name."""
     return {c.reference: np.eye(4)} | {name: c.T_imu_sensor(name) for name in c.mounted}
 
 
-def spread(c: Calibration) -> float:
+def spread_of(c: Calibration) -> float:
     """Size of the rig [m], which scales the drawn shapes: largest extent of the sensor origins along an axis of the imu
     frame."""
-    origins = np.array([T[:3, 3] for T in frames(c).values()])
+    origins = np.array([T[:3, 3] for T in frames_of(c).values()])
     return max(float(np.ptp(np.vstack([origins, np.zeros(3)]), axis=0).max()), _LEAST_SPREAD_M)
 
 
-def shape(c: Calibration, name: str) -> np.ndarray | None:
+def shape_of(c: Calibration, name: str) -> np.ndarray | None:
     """(n, 3) polylines of a sensor's shape in the sensor frame [m]; None if its kind has no shape."""
-    return call_kind(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread(c))
+    return call_kind(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread_of(c))
 
 
 def legends(c: Calibration) -> list[str]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.data.stamps.clocks import TimeUnit
 from icalib.data.tables.table_kernels import LEFT_OUT
-from icalib.rig import Axes, TimeUnit
+from icalib.rig import Axes
 
 _UNIT = re.compile(r"\[[^]]*\]|\([^)]*\)")
 _CAMEL = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")

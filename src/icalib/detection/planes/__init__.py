@@ -517,3 +517,17 @@ def sum_cells(points, variance, plane, cell, distance, stats, moments):
         row = (1.0, x, x * x, y, y * x, y * y, z, z * x, z * y, z * z)
         for k in range(MOMENTS):
             moments[q, k] += row[k] / variance[n]
+
+
+MIN_DIRECTION_SHARE = 0.02  # of the points: 0.2 and more for a direction that walls face, 0.002 and less by noise
+
+
+def count_directions(shares: np.ndarray) -> int:
+    """Number of independent directions that surfaces face, 0 to 3. shares (3,): see `normal_shares`."""
+    return int((shares > MIN_DIRECTION_SHARE).sum())
+
+
+def normal_shares(normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Shares (3,) of the total weight along the principal axes of normals, increasing: eigenvalues of the weighted mean
+    of n n^T. normal (n, 3); weight (n,)."""
+    return np.linalg.eigvalsh((normal * weight[:, None]).T @ normal / weight.sum())

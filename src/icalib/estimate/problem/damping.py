@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 CURVED_BELOW_SHARE = 1e-2  # of the cost: steps that predict less use the true curvature of the robust loss
 # Nielsen 1999, "Damping parameter in Marquardt's method": smallest reduction factor of damping after a failure
@@ -11,7 +10,8 @@ MIN_FACTOR_AFTER_FAILURE = 1.0 / 3.0
 MIN_GAIN_RATIO = 0.25  # actual over predicted decrease: below it damping is not reduced
 
 
-class DampingSchedule(NamedTuple):
+@dataclass(frozen=True)
+class DampingSchedule:
     """Damping schedule. least_after_failure: least damping after a failed step. growth: factor after a failure; its
     powers after successive failures. min_factor: smallest reduction factor after successive good steps. zero_below:
     damping below it is set to 0, so that it does not swamp the weak information of a planar drive."""

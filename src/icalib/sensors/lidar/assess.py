@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.data.measurements import LidarStream
+from icalib.detection.planes import count_directions, normal_shares
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.problem.assembly import motion_of
 from icalib.estimate.problem.inputs import Inputs, origin_difference
@@ -22,7 +23,6 @@ from icalib.result.excess import excess, times
 from icalib.result.timeline import Timeline
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.binning import LidarNoise, in_world
-from icalib.sensors.lidar.initialize.voxel_map import count_directions, normal_shares
 from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
 

@@ -17,8 +17,8 @@ from icalib.result.row_records import row_record
 from icalib.result.timeline import Timeline
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
-from icalib.sensors.wheels.initialize.drive_guess import REVERSED_YAW
 from icalib.sensors.wheels.residual import WheelFactor
+from icalib.sensors.wheels.spec import REVERSED_YAW
 
 LABELS = {"wheels": ("left", "right"), "lateral slip": ("lateral",), "vertical slip": ("vertical",)} | {
     "yaw": ("yaw",),

@@ -33,6 +33,17 @@ RateUnit = Literal["rad/s", "deg/s", "rpm"]
 RATE_UNITS: dict[RateUnit, float] = {"rad/s": 1.0, "deg/s": math.pi / 180.0, "rpm": math.pi / 30.0}  # in rad/s
 WheelKind = Literal["pair", "steered", "twist"]  # meaning of the two columns of a `WheelStream`
 
+# For each kind of wheels: why their yaw rate may be opposite to that of the IMU, and how to correct it.
+REVERSED_YAW: dict[WheelKind, str] = {
+    "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
+    "to [-1, -1] (skid-steer: [-1, -1, -1, -1]) in the rig file",
+    "twist": "its yaw rate must be positive to the left; set signs to [1, -1] in the rig file",
+    "steered": (
+        "its steering angle must be positive to the left and its wheel must turn forwards; correct the wrong sign "
+        "in the rig file: set signs to [1, -1] or to [-1, 1]"
+    ),
+}
+
 # Drive parameters of each kind of wheels: those besides extrinsics and time offset.
 DRIVES: dict[WheelKind, tuple[ParameterSpec, ...]] = {
     "pair": (

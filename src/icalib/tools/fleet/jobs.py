@@ -45,9 +45,9 @@ def load_jobs(path: str | Path) -> tuple[Job, ...]:
 def _job(value: YamlValue, defaults: dict[str, YamlValue], folder: Path) -> Job:
     job_fields = value.record(("recording",), ("name", "robot", "rig", "time"))
     fields = defaults | job_fields
-    for field in ("robot", "rig"):
-        if field not in fields:
-            value.fail(f"{field} is missing; add {field}, here or for all jobs in defaults.")
+    for name in ("robot", "rig"):
+        if name not in fields:
+            value.fail(f"{name} is missing; add {name}, here or for all jobs in defaults.")
     rig = folder / fields["rig"].text()
     if not rig.is_file():
         fields["rig"].fail(f"{rig} does not exist; correct the path of the rig file.")

@@ -105,7 +105,7 @@ class KindInspector:
             yield from (f"  # {line}" for line in self.doubt if not is_active)
             lines = self.lines(inspection, name, topic)
             fields = (f"type: {source.kind}", place_line(topic.name, topic.type), *lines)
-            for line in (f"{name}:", *(f"  {field}" for field in fields)):
+            for line in (f"{name}:", *(f"  {line}" for line in fields)):
                 yield f"  {'' if is_active else '# '}{line}"
         yield from (f"  {line}" for line in self.more_lines(inspection, active))
 

@@ -69,15 +69,15 @@ def spans(c: Calibration) -> tuple[RecordingSpan, ...]:
 
 def log_rig(s: RerunStream, c: Calibration) -> None:
     """Sends frames and shapes of all sensors, at constant poses relative to the body."""
-    spread = rig_shapes.spread(c)
-    for name, T in rig_shapes.frames(c).items():
+    spread = rig_shapes.spread_of(c)
+    for name, T in rig_shapes.frames_of(c).items():
         s.still(place(c, name), s.rr.TransformAxes3D(0.25 * spread))
         if name != c.reference:
             s.still(place(c, name), s.rr.Transform3D(translation=T[:3, 3], mat3x3=T[:3, :3]))
     for name in c.lenses:
         s.still(f"{place(c, name)}/image", _pinhole(s, c, name, 0.45 * spread))
     others = [name for name in c.mounted if name not in c.lenses]
-    shapes = [(name, pen) for name in others if (pen := rig_shapes.shape(c, name)) is not None]
+    shapes = [(name, pen) for name in others if (pen := rig_shapes.shape_of(c, name)) is not None]
     for i, (name, pen) in enumerate(shapes):
         strips = s.rr.LineStrips3D(_strips(pen), colors=rgb(COLORS[i % len(COLORS)]))
         s.still(f"{place(c, name)}/shape", strips)

@@ -69,8 +69,8 @@ def _projection_section(c: Calibration) -> Section:
         for k, m in enumerate(projection_figures.projection_maps(c, name)):
             place = f"projection-{i}-{k}"
             figures[place] = projection_figures.projection_figure(m, residuals, size)
-            title = element("h3", f"{name}: {projection_figures.title(m).lower()}")
-            maps.append(element("div", [title, element("p", projection_figures.words(m)), plot_place(place)]))
+            title = element("h3", f"{name}: {projection_figures.map_title(m).lower()}")
+            maps.append(element("div", [title, element("p", projection_figures.map_words(m)), plot_place(place)]))
         fixed = f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact."
         parts.append(element("div", maps, "pair") if maps else element("p", fixed, "quiet"))
     return Section("projection", "How well each lens is known", _LENS_WORDS, Html("".join(parts)), figures)

@@ -12,7 +12,7 @@ from icalib.result import Calibration, ProjectionMap, projection_uncertainty, wo
 from icalib.result.quantities import format_number
 from icalib.sensors.camera.record import ImageResiduals
 
-MOST_DOTS = 1500
+MOST_RESIDUAL_DOTS = 1500
 WIDEST = 6.0  # end of the colour scale, in medians over the seen cells, so that edges without data do not set it
 LEVELS = 9  # least number of contours
 UNOBSERVED_RATIO = 3.0  # worst over median sigma, above which the page asks for observations near the worst pixel
@@ -50,7 +50,7 @@ def projection_figure(m: ProjectionMap, residuals: Sequence[ImageResiduals], res
     traces = [heat]
     for r in residuals:
         used = r.uv[r.used]
-        used = used[thin(len(used), MOST_DOTS)]
+        used = used[thin(len(used), MOST_RESIDUAL_DOTS)]
         marker = {"color": "#b45309", "size": 2.5, "opacity": 0.35}
         traces.append(dots(used[:, 0], used[:, 1], r.kind, "", marker=marker, hoverinfo="skip"))
     return figure(
@@ -69,12 +69,12 @@ def _round(step: float) -> float:
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= 1.001 * step))
 
 
-def title(m: ProjectionMap) -> str:
+def map_title(m: ProjectionMap) -> str:
     """Title of a map: the distance of the points."""
     return "Points far away" if np.isinf(m.range_m) else f"Points {format_number(m.range_m)} m away, like those it saw"
 
 
-def words(m: ProjectionMap) -> str:
+def map_words(m: ProjectionMap) -> str:
     """Text on a map: the median and the largest standard deviation, and what they mean."""
     size, u, v = m.worst
     where = "where it saw points" if m.seen.any() else "over the image"

@@ -33,7 +33,7 @@ class ImuInspector(KindInspector):
     is_certain: ClassVar[bool] = True
     sets_origin: ClassVar[bool] = True
     section: ClassVar[str] = "imus"
-    checks: ClassVar = {"use": findings.refused, "quality": findings.readings, "gaps": findings.gaps}
+    checks: ClassVar = {"use": findings.refused, "quality": findings.of_readings, "gaps": findings.gaps}
 
     def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, ImuSource]]:
         """See `KindInspector`."""

@@ -30,7 +30,7 @@ def refused(inspection: Inspection) -> Iterator[Finding]:
             yield Finding("problem" if is_fatal else "warning", problem)
 
 
-def readings(inspection: Inspection) -> Iterator[Finding]:
+def of_readings(inspection: Inspection) -> Iterator[Finding]:
     """Units and motion of the IMU to calibrate with."""
     if inspection.imu is None or inspection.facts[inspection.imu].problem:
         return

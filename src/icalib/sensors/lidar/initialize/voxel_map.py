@@ -21,6 +21,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.data.measurements import LidarStream
+from icalib.detection.planes import count_directions, normal_shares
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.small import eigen3, mul3
@@ -301,7 +302,6 @@ MAX_SAMPLED_POINTS = 6000  # of a scan
 NORMAL_VOXEL_M = 1.0  # edge of the voxels whose normals are counted
 MAX_NORMAL_VOXELS = 1 << 13
 MIN_PLANAR_SCANS = 5  # scans with planar voxels, for a verdict
-MIN_DIRECTION_SHARE = 0.02  # of the points: 0.2 and more for a direction that walls face, 0.002 and less by noise
 DEGENERACIES = {
     1: "face one direction only, such as a floor or parallel walls, so the motion along them is unobservable",
     2: "face two directions only, as in a corridor, so the motion along both is unobservable",
@@ -331,11 +331,6 @@ def n_directions(stream: LidarStream) -> int:
     return count_directions(np.median(shares, axis=0)) if len(shares) >= MIN_PLANAR_SCANS else 0
 
 
-def count_directions(shares: np.ndarray) -> int:
-    """Number of independent directions that surfaces face, 0 to 3. shares (3,): see `normal_shares`."""
-    return int((shares > MIN_DIRECTION_SHARE).sum())
-
-
 def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
     """`normal_shares` (3,) of a scan, weighted by points; None if no voxel is planar."""
     xyz = stream.xyz[stream.start[scan] : stream.start[scan + 1]].astype(np.float64)
@@ -347,9 +342,3 @@ def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
     insert(voxels, identity, xyz, np.zeros(len(xyz)), 0, 1.0)
     normal, weight = voxels.normal[voxels.flat], voxels.weight[voxels.flat]
     return normal_shares(normal, weight) if len(normal) else None
-
-
-def normal_shares(normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """Shares (3,) of the total weight along the principal axes of normals, increasing: eigenvalues of the weighted mean
-    of n n^T. normal (n, 3); weight (n,)."""
-    return np.linalg.eigvalsh((normal * weight[:, None]).T @ normal / weight.sum())

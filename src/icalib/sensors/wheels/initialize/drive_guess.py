@@ -24,6 +24,7 @@ from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.pose_rows import Extrinsics
 from icalib.motion.stamp_intervals import MAX_INTERVAL_S
 from icalib.rig import WheelKind, drive_names
+from icalib.sensors.wheels.spec import REVERSED_YAW
 
 CORRELATION_HZ = 100.0  # grid of the correlation; Gauss-Newton refines its peak
 MIN_OVERLAP_S = 4.0  # of IMU and wheel readings; shorter overlaps correlate by chance
@@ -46,17 +47,6 @@ UNIT_TOLERANCE = 0.1  # relative difference between a scale and the factor of a 
 MIN_RATE_VARIATION = 0.5  # standard deviation over mean of the yaw rate; any offset fits a constant rate
 MAX_STEERING_OFFSET_RAD = 1.2  # beyond the range of any steering: another quantity was recorded
 REJECTION = 5.0  # median absolute residuals (3.4 standard deviations); rows with larger residuals are rejected as slip
-
-# For each kind of wheels: why their yaw rate may be opposite to that of the IMU, and how to correct it.
-REVERSED_YAW: dict[WheelKind, str] = {
-    "pair": "its left and right wheels are swapped, or both count backwards; swap its columns or joints, or set signs "
-    "to [-1, -1] (skid-steer: [-1, -1, -1, -1]) in the rig file",
-    "twist": "its yaw rate must be positive to the left; set signs to [1, -1] in the rig file",
-    "steered": (
-        "its steering angle must be positive to the left and its wheel must turn forwards; correct the wrong sign "
-        "in the rig file: set signs to [1, -1] or to [-1, 1]"
-    ),
-}
 
 
 class ReversedYawError(MotionContradictedError):

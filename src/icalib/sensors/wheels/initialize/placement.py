@@ -27,7 +27,6 @@ from icalib.optim.state import Key, State
 from icalib.rig import Wheels
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive_guess import (
-    REVERSED_YAW,
     ReversedYawError,
     WheelRates,
     drive_guess,
@@ -36,6 +35,7 @@ from icalib.sensors.wheels.initialize.drive_guess import (
 )
 from icalib.sensors.wheels.initialize.relative_pose_guess import extrinsics_guess, poses_offset
 from icalib.sensors.wheels.integrals import integrals_of
+from icalib.sensors.wheels.spec import REVERSED_YAW
 
 SIMPSON_WEIGHTS = np.array([1.0, 4.0, 1.0]) / 6.0  # of start, middle and end of an interval
 
