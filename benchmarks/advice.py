@@ -22,14 +22,14 @@ import ten_runs
 from scipy.signal import lfilter
 
 from icalib.data.measurements import Measurements
-from icalib.data.stamps.window import Window, cut
+from icalib.data.stamps import Window, cut
 from icalib.errors import CalibrationError
 from icalib.geometry.targets import AprilGrid, NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
 from icalib.sensors.lidar.simulate import SimLidar
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, rig_for, simulate, with_drawn_guess
 
 SIGMAS = 4.0

@@ -13,12 +13,12 @@ import numpy as np
 from rendered import scenario_of
 from throughput import TARGETS
 
-from icalib.detection.boards.detectors import detector_of
+from icalib.detection.detectors import detector_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid, Target
-from icalib.sensors.camera.edge_curvature import predicted_curvature
+from icalib.sensors.camera.corner_bias import predicted_curvature
 from icalib.tools.simulation import Film, film
-from icalib.tools.simulation.images.rendering import exposure_poses
+from icalib.tools.simulation.rendering import exposure_poses
 
 SMALL_TAGS = AprilGrid(6, 6, 0.05, 0.5, border_bits=2, squares=False)
 FAR_PX = 100.0

@@ -30,7 +30,7 @@ from icalib.sensors.imu.spec import class_imperfections
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Room, Scenario, Simulation, handheld, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"

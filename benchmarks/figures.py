@@ -19,11 +19,11 @@ import numpy as np
 import icalib
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.data.recordings import open_recording, read_measurements
-from icalib.estimate.problem.assembly import assemble
-from icalib.estimate.problem.inputs import inputs_for
+from icalib.estimate.inputs import inputs_for
+from icalib.estimate.problem import assemble
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.multi_recording import initial_state
+from icalib.sensors.camera.initialize import initial_state
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.sensors.camera.model import MODEL
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from icalib.detection import AprilGridDetector
-from icalib.detection.tracking.tracker import Tracker
+from icalib.detection.tracker import Tracker
 from icalib.geometry.targets import NoTarget
 from icalib.tools.simulation import Scenario, film, handheld, load_scenario
 

@@ -22,10 +22,10 @@ from gtsam.symbol_shorthand import B, L, T, V, X
 
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.estimate.estimate import Estimate, estimate
-from icalib.estimate.problem.inputs import Inputs, inputs_for
+from icalib.estimate.inputs import Inputs, inputs_for
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.multi_recording import initial_state
+from icalib.sensors.camera.initialize import initial_state
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
 from icalib.sensors.parameter import fixed
 

@@ -24,11 +24,10 @@ from icalib.data.measurements import ImuStream
 from icalib.rig import Settings
 from icalib.rig.file import rig_to_dict
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_film
-from icalib.tools.simulation.images.filming import Film, Shot
-from icalib.tools.simulation.images.rendering import Imaging
-from icalib.tools.simulation.sensors.corners import image_stamps
-from icalib.tools.simulation.sensors.imu import imu_stamps, read_imu
-from icalib.tools.simulation.sensors.motion import Waves, reference_motion
+from icalib.tools.simulation.corners import image_stamps
+from icalib.tools.simulation.filming import Film, Shot
+from icalib.tools.simulation.motion import Waves, imu_stamps, read_imu, reference_motion
+from icalib.tools.simulation.rendering import Imaging
 
 PERIOD_S = 20.0
 TARGET_MB = 500.0

@@ -27,8 +27,7 @@ from icalib.rig import PoseSensor, Rig
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
 

@@ -21,8 +21,8 @@ from threadpoolctl import threadpool_limits
 
 from icalib.data.measurements import Measurements
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.assembly import motion_of
-from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.inputs import Inputs
+from icalib.estimate.problem import motion_of
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import Determined, determine
 from icalib.rig import Rig

@@ -18,7 +18,7 @@ from typing import Any
 
 from icalib.base.files import write_texts
 from icalib.result.quantities import format_number
-from icalib.sensors.parameter_spec import display_unit
+from icalib.sensors.parameter import display_unit
 from icalib.tools.montecarlo.record import from_json
 from icalib.tools.montecarlo.summary import Nees, consistency_json, summarise
 

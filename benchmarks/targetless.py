@@ -25,7 +25,7 @@ import icalib
 from icalib.errors import CalibrationError
 from icalib.rig import Parameter, Rig, Settings
 from icalib.rig.file import rig_to_dict
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.montecarlo.summary import Sample, nees
 from icalib.tools.simulation import ImageFaults, Scenario, Simulation, load_scenario, rig_for, simulate, write_sensors
 

@@ -12,9 +12,9 @@ from icalib.data.recordings import open_recording
 from icalib.rig import Rig
 from icalib.sensors.camera.read.image_tracks import find_tracks
 from icalib.tools.simulation import SimCamera, Simulation
-from icalib.tools.simulation.images.rendering import unproject
-from icalib.tools.simulation.scenario.projection import image_velocity, project, visible
-from icalib.tools.simulation.scenario.room import Room, distances
+from icalib.tools.simulation.projection import image_velocity, project, visible
+from icalib.tools.simulation.rendering import unproject
+from icalib.tools.simulation.room import Room, distances
 
 OUTLIER_PX = 1.0
 _FITS = 5

@@ -17,13 +17,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import Estimate, estimate
-from icalib.estimate.problem.inputs import inputs_for
+from icalib.estimate.inputs import inputs_for
 from icalib.geometry.blas import subtract_gram
 from icalib.geometry.targets import NoTarget
 from icalib.optim.arrowhead import Piece, solve
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
+from icalib.sensors.camera.initialize import initial_guesses, initial_state
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 SCENARIO = Path(__file__).parents[1] / "examples" / "paper" / "table2-3d.yaml"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import icalib
-from icalib.cli import console, progress
+from icalib.cli import console
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def shown(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     parts.display, parts.HTML = display, lambda text: text  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "IPython", ipython)
     monkeypatch.setitem(sys.modules, "IPython.display", parts)
-    monkeypatch.setattr(progress, "EVERY_S", 0.0)
+    monkeypatch.setattr(console, "EVERY_S", 0.0)
     return texts
 
 
@@ -46,7 +46,7 @@ def test_nothing_is_left_where_the_work_fails(shown: list[str]):
 
 
 def test_a_notebook_redraws_only_now_and_then(shown: list[str], monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(progress, "EVERY_S", 100.0)
+    monkeypatch.setattr(console, "EVERY_S", 100.0)
     with icalib.progress_bar() as show:
         for k in range(50):
             show("solving", k / 50)
@@ -64,4 +64,4 @@ def test_elsewhere_it_is_that_of_the_console(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(console, "progress_bar", spy)
     with icalib.progress_bar() as show:
         show("solving", 0.5)
-    assert made == [False] and not progress.in_notebook()
+    assert made == [False] and not console.in_notebook()

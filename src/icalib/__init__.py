@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from icalib.cli.progress import progress_bar
+    from icalib.cli.console import progress_bar
     from icalib.data.recordings import open_recording
     from icalib.errors import CalibrationError
     from icalib.pipeline import calibrate, calibrate_measurements
@@ -54,7 +54,7 @@ _HOME = {
     "load_rig": "icalib.rig.file",
     "open_recording": "icalib.data.recordings",
     "prior": "icalib.sensors.parameter",
-    "progress_bar": "icalib.cli.progress",
+    "progress_bar": "icalib.cli.console",
 }
 
 _NAMED = {"check": "check_calibration", "compare": "compare_files", "inspect": "inspect_recording"}  # in their modules

@@ -13,20 +13,18 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from icalib.data.measurements import Measurements, streams_of_rig
-from icalib.data.recordings import Recording, read_measurements
-from icalib.data.recordings.base import Progress
-from icalib.data.recordings.opening import Source, naming, noting, open_all, without_jumps
+from icalib.data.recording import Progress
+from icalib.data.recordings import Recording, Source, naming, noting, open_all, read_measurements, without_jumps
 from icalib.errors import EstimationError, RecordingError
-from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.outcome import Visit
-from icalib.estimate.problem.problem import Problem
-from icalib.initialize.attempts import attempt
+from icalib.estimate.inputs import Inputs
+from icalib.estimate.problem import Problem
+from icalib.estimate.solver import Visit
+from icalib.initialize.rig_guess import attempt
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
-from icalib.result.provenance import provenance
+from icalib.result.calibration import provenance
 from icalib.rig import Rig
-from icalib.rig.complete import check_complete
-from icalib.rig.file import load_rig
+from icalib.rig.file import check_complete, load_rig
 from icalib.sensors import call_kind
 from icalib.validation import assess, stated_words, visited
 

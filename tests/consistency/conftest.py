@@ -15,8 +15,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Scenario, load_scenario, simulate
 

@@ -13,7 +13,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.initialize.assumed_motion import _with_rate
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
@@ -21,7 +21,7 @@ from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Scenario, Simulation, load_scenario, rig_for, simulate
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

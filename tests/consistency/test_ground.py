@@ -12,7 +12,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")

@@ -8,7 +8,7 @@ from tests.consistency.test_unobservable_motion import thin
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import estimate
-from icalib.estimate.residual_statistics.jacobian_noise import spurious_information
+from icalib.estimate.jacobian_noise import spurious_information
 from icalib.observability import determination
 from icalib.pipeline import calibrate_measurements
 from icalib.tools.simulation import rig_for, simulate, with_drawn_guess

@@ -7,15 +7,14 @@ import pytest
 import yaml
 
 from icalib.pipeline import calibrate_measurements
-from icalib.result.summary import calibration_yaml, parameter_keys
+from icalib.result.saving import calibration_yaml, parameter_keys
 from icalib.result.verdict import by_size, worst
-from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
+from icalib.rig.rig import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.sensor import MOUNTED
-from icalib.tools.comparison.compare import compare_sides
-from icalib.tools.comparison.results import side_of_result
-from icalib.tools.montecarlo.one_run import true_value
+from icalib.tools.comparison.compare import compare_sides, side_of_result
+from icalib.tools.montecarlo.record import true_value
 from icalib.tools.simulation import rig_for, simulate
 
 pytestmark = pytest.mark.slow

@@ -14,9 +14,9 @@ from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import relative_poses
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, rig_for, simulate
-from icalib.tools.simulation.scenario.robot import DriveKind
+from icalib.tools.simulation.trajectory import DriveKind
 
 ROOM = Room((8.0, 6.0, 3.0))
 NOISE = {"absolute": (2e-3, 1e-3), "relative": (5e-3, 1e-2)}

@@ -12,8 +12,8 @@ from icalib.estimate.estimate import Callbacks, EstimateOptions, estimate
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.motion.factor import of_type
-from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.model import ENOUGH_USED
+from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 

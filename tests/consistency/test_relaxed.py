@@ -9,7 +9,7 @@ import pytest
 
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import classify_directions, determine
-from icalib.observability.relaxed import freed_inputs, relaxed
+from icalib.observability.prior_sensitivity import freed_inputs, relaxed
 from icalib.optim.arrowhead import solve
 from icalib.rig import Parameter
 from icalib.tools.simulation import handheld, rig_for, simulate

@@ -14,7 +14,7 @@ from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.result import Calibration
 from icalib.rig import Rig, Settings
 from icalib.tools.simulation import Film, Scenario, Truth, film, handheld, rig_for, tag_map, write_film
-from icalib.tools.simulation.scenario.projection import project
+from icalib.tools.simulation.projection import project
 from icalib.tools.simulation.writing import FORMS, Form
 
 pytest.importorskip("cv2")

@@ -13,7 +13,7 @@ from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from icalib.errors import CalibrationError
-from icalib.estimate.problem.inputs import Inputs
+from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.state import State

@@ -18,7 +18,7 @@ from icalib.initialize.rig_guess import guess_of_rig
 from icalib.result.verdict import UNUSABLE
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.one_run import RunTask, run
+from icalib.tools.montecarlo.record import RunTask, run
 from icalib.tools.montecarlo.summary import Sample, nees
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
 

@@ -17,8 +17,8 @@ from icalib.model.bodies import Bodies
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.initialize.boards.scene_intrinsics import check_bodies_still, find_scene, scene_error_ratios
+from icalib.sensors.camera.initialize.scene_intrinsics import check_bodies_still, find_scene, scene_error_ratios
+from icalib.sensors.camera.model import choose_bodies, restrict
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, tag_map
 
 

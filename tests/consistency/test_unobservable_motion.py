@@ -14,7 +14,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE
 from icalib.sensors.lidar.simulate import SimLidar
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 from icalib.tools.simulation.rigs import Treatment
 

@@ -12,7 +12,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Scenario, rig_for, simulate
 
 MOUNTS = ("rotation", "translation", "time_offset")

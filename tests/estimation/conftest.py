@@ -14,26 +14,24 @@ from scipy.spatial.transform import Rotation
 from tests.typed import instance, not_none
 
 from icalib.data.measurements import CornerStream, LidarStream, TrackStream
-from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.tolerances import specs_of, tolerance_of
+from icalib.estimate.inputs import specs_of, tolerance_of
+from icalib.estimate.problem import Problem
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
-from icalib.motion.keyframe_placement import place_keyframes
-from icalib.motion.poses import assign_keyframes
-from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.poses import EstimatedMotion, assign_keyframes, place_keyframes
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
-from icalib.sensors.camera.connected_bodies import restrict
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
-from icalib.sensors.camera.features.residual import FeatureFactor
-from icalib.sensors.camera.features.surfaces import OnPlanes, Surfaces
-from icalib.sensors.camera.features.tracks import TrackNoise
+from icalib.sensors.camera.model import restrict
+from icalib.sensors.camera.track_factor import FeatureFactor
+from icalib.sensors.camera.track_surfaces import OnPlanes, Surfaces
+from icalib.sensors.camera.tracks import TrackNoise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise

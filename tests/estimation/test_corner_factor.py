@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.sensors.camera.corner_factor import CornerNoise
-from icalib.tools.simulation.scenario.projection import project
+from icalib.tools.simulation.projection import project
 
 
 @pytest.fixture(scope="module")

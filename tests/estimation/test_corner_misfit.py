@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import CornerStream
-from icalib.sensors.camera.corner_misfit import lens_misfit
+from icalib.sensors.camera.corner_noise import lens_misfit
 
 SIZE = np.array([752.0, 480.0])
 

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.model.bodies import Bodies
 from icalib.rig import Settings
-from icalib.sensors.camera.corner_outliers import inliers, isolated
+from icalib.sensors.camera.corner_noise import inliers, isolated
 
 SIZE = np.array([900.0, 600.0])
 NOISE_PX = 0.15

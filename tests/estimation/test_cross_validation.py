@@ -10,12 +10,10 @@ import numpy as np
 import pytest
 from tests.estimation.test_arrowhead import random_pieces
 
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.residual_statistics.cross_validation import Half, excess, halves_of, predict, shifts
-from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind
-from icalib.estimate.residual_statistics.segments import MIN_SEGMENT_KEYFRAMES, Segments
-from icalib.optim.arrowhead import KEYFRAME_DIM, chain_step_given_calib
-from icalib.optim.prior_factor import Prior
+from icalib.estimate.cross_validation import Half, excess, halves_of, predict, shifts
+from icalib.estimate.residual_statistics import MIN_SEGMENT_KEYFRAMES, Segments, chi2_by_kind
+from icalib.estimate.solver import minimise
+from icalib.optim.arrowhead import KEYFRAME_DIM, Prior, chain_step_given_calib
 from icalib.tools.simulation import handheld, simulate
 
 NO_PRIOR = np.zeros((3, 3)), np.zeros(3)

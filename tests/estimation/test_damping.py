@@ -7,9 +7,7 @@ from typing import Any, cast
 
 import pytest
 
-from icalib.estimate.problem.damping import CAREFUL_DAMPING, Damping
-from icalib.estimate.problem.descent import Descent
-from icalib.estimate.problem.outcome import Step
+from icalib.estimate.solver import CAREFUL_DAMPING, Damping, Descent, Step
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from icalib.estimate.residual_statistics.jacobian_noise import Spurious
+from icalib.estimate.jacobian_noise import Spurious
 from icalib.observability.determination import _are_alike, _principal_directions, scatter
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]

@@ -9,14 +9,11 @@ import numpy as np
 import pytest
 
 from icalib.estimate import estimate as estimates
+from icalib.estimate import solver
 from icalib.estimate.estimate import Estimate, EstimateOptions, MeasurementModel, estimate
-from icalib.estimate.problem import descent
-from icalib.estimate.problem.assembly import given_priors
-from icalib.estimate.problem.descent import Descent
-from icalib.estimate.problem.guess_priors import guess_priors, guess_sigma
-from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.solver_options import SolverOptions
-from icalib.estimate.problem.tolerances import UNGUESSED_TRANSLATION_SIGMA_M
+from icalib.estimate.inputs import UNGUESSED_TRANSLATION_SIGMA_M, Inputs
+from icalib.estimate.problem import given_priors, guess_priors, guess_sigma
+from icalib.estimate.solver import Descent, SolverOptions
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
@@ -89,7 +86,7 @@ def same_information(found: Estimate) -> None:
 def test_where_they_counted_to_the_end_the_estimate_is_half_way_and_without_them(begun, monkeypatch, doubtful: bool):
     """Guesses are taken to be good to a hundredth, so that they would be missed. To the last digit: by steps until
     nothing is left."""
-    monkeypatch.setattr(descent, "SMALL_DECREASE", 0.0)
+    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
     inputs, state = begun
     asked: list[int] = []
@@ -138,7 +135,7 @@ def test_the_last_step_is_taken_with_the_sums_at_hand(begun, monkeypatch):
     monkeypatch.setattr(estimates, "guess_priors", partial(guess_priors, times=1e-2))
     inputs, state = begun
     short = estimate(inputs, state, EstimateOptions(guess=state))
-    monkeypatch.setattr(descent, "SMALL_DECREASE", 0.0)
+    monkeypatch.setattr(solver, "SMALL_DECREASE", 0.0)
     long = estimate(inputs, state, EstimateOptions(guess=state))
     assert len(short.steps) < len(long.steps)
     assert short.outcome.converged and short.outcome.cost == pytest.approx(long.outcome.cost, abs=1e-4)

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.estimate.problem.assembly import keyframe_times, keyframes_for
-from icalib.estimate.problem.inputs import inputs_for
-from icalib.motion.time_offsets import instants
+from icalib.estimate.inputs import inputs_for
+from icalib.estimate.problem import keyframe_times, keyframes_for
+from icalib.motion.poses import instants
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 

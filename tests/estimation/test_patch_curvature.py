@@ -7,7 +7,7 @@ import pytest
 
 from icalib.data.measurements import TrackStream
 from icalib.geometry.cameras import camera_model
-from icalib.sensors.camera.features.patch_curvature import with_curved_patches
+from icalib.sensors.camera.track_surfaces import with_curved_patches
 
 LENSES = {
     "pinhole-radtan": [458.7, 457.3, 367.2, 248.4, -0.283, 0.074, 2e-4, 2e-5],

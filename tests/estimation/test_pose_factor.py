@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
 from icalib.data.measurements import PoseStream
-from icalib.estimate.problem.assembly import pass_at
-from icalib.estimate.problem.inputs import inputs_for
-from icalib.motion.pose_rows import Frame, absolute_residuals, relative_residuals
+from icalib.estimate.inputs import inputs_for
+from icalib.estimate.problem import pass_at
+from icalib.motion.factor import Frame, absolute_residuals, relative_residuals
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import State
 from icalib.rig import PoseSensor

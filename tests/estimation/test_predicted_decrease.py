@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.sensors.camera.features.kernels import predicted_decrease
+from icalib.sensors.camera.track_kernels import predicted_decrease
 
 
 def test_it_is_that_of_a_newton_step_and_nothing_where_there_is_no_inverse():

@@ -11,8 +11,8 @@ from tests.consistency.test_pose_sensors import BLOCKS, alone, errors, sensor, w
 
 from icalib.data.measurements import PoseStream
 from icalib.estimate.estimate import DEFAULT_OPTIONS, estimate
-from icalib.estimate.residual_statistics.score_test import score_test
-from icalib.estimate.residual_statistics.segments import Segments
+from icalib.estimate.residual_statistics import Segments
+from icalib.estimate.score_test import score_test
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.motion.factor import of_type
 from icalib.pipeline import calibrate_measurements

@@ -10,7 +10,7 @@ from tests.estimation.test_pose_factor import pose
 from tests.typed import instance, not_none
 
 from icalib.estimate.estimate import MeasurementModel
-from icalib.estimate.problem.inputs import Inputs, inputs_for
+from icalib.estimate.inputs import Inputs, inputs_for
 from icalib.optim.arrowhead import solve
 from icalib.optim.state import State
 from icalib.sensors.imu.residual import ImuFactor

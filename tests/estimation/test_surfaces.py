@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.motion.plane_association import PlaneAssociation
+from icalib.motion.point_planes import PlaneAssociation
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.camera.features.surfaces import CELL_M, MAX_PLANE_DISTANCE_M, PATCH_M, Surfaces, most_alike
+from icalib.sensors.camera.track_surfaces import CELL_M, MAX_PLANE_DISTANCE_M, PATCH_M, Surfaces, most_alike
 from icalib.sensors.lidar.binning import points_on_planes
 from icalib.tools.simulation import handheld, simulate
 

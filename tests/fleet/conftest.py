@@ -11,13 +11,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from icalib.export.outputs import output_files
+from icalib.export.formats import output_files
 from icalib.pipeline import calibrate
 from icalib.result import Calibration
 from icalib.rig.file import rig_to_dict
 from icalib.tools.fleet import run as run_module
-from icalib.tools.fleet.one_job import JobOutcome, JobTask
-from icalib.tools.fleet.record import JobRecord
+from icalib.tools.fleet.result import JobOutcome, JobRecord, JobTask
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 # Of cam1 about its x axis: ten times the standard deviation of the difference of two calibrations from 6 s.

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, Verdict
-from icalib.tools.fleet.drift import Drift, by_chance, drift_of
+from icalib.tools.fleet.result import Drift, by_chance, drift_of
 
 
 def drift(calibrations: list[Calibration], limit: float = 3.0) -> Drift:

@@ -10,11 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.tools.fleet.figures import over_time, sensors
-from icalib.tools.fleet.jobs import Job
-from icalib.tools.fleet.record import GroupRecord, JobRecord
-from icalib.tools.fleet.result import JobResult
-from icalib.tools.fleet.words import care_words, verdict_words
+from icalib.tools.fleet.page import care_words, over_time, sensors, verdict_words
+from icalib.tools.fleet.result import GroupRecord, Job, JobRecord, JobResult
 
 R0 = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 XYZ = ("x", "y", "z")

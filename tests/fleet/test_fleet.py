@@ -14,11 +14,11 @@ import pytest
 from icalib.base.files import COMMIT
 from icalib.cli import main
 from icalib.errors import CalibrationError
-from icalib.geometry.euler import rpy, rpy_std
+from icalib.geometry.so3 import rpy, rpy_std
 from icalib.result import joint_covariance, load_calibration
 from icalib.tools.fleet import Fleet, run_fleet
 from icalib.tools.fleet import run as run_module
-from icalib.tools.fleet.record import from_json, to_json
+from icalib.tools.fleet.result import from_json, to_json
 
 NAMES = ["anton-r0", "anton-turned", "berta-r0", "berta-r1"]
 BAD = "  - {robot: berta, recording: bad, time: 2026-10-09}\n"
@@ -197,7 +197,7 @@ def test_a_job_that_killed_its_workers_is_reported_and_tried_again_the_next_time
 
 
 def test_another_icalib_on_a_worker_is_refused(fleet_folder: Path, workshop, monkeypatch):
-    monkeypatch.setattr("icalib.tools.fleet.inputs.program", lambda: "of the worker")
+    monkeypatch.setattr("icalib.tools.fleet.result.program", lambda: "of the worker")
     with pytest.raises(CalibrationError, match="a worker of the cluster runs another version of icalib"):
         fleet(fleet_folder)
 

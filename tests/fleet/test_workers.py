@@ -15,7 +15,7 @@ import pytest
 from icalib.errors import CalibrationError
 from icalib.result import load_calibration
 from icalib.tools.fleet import Crew, run_fleet
-from icalib.tools.fleet.jobs import load_jobs
+from icalib.tools.fleet.result import load_jobs
 
 pytestmark = pytest.mark.slow
 

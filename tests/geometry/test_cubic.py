@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.geometry.vectors import hermite
+from icalib.geometry.small import hermite
 
 
 def test_a_cubic_is_followed_from_its_values_and_slopes_at_both_ends():

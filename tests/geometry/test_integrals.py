@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.geometry.integrals import once_integrated, twice_integrated
+from icalib.geometry.small import once_integrated, twice_integrated
 
 
 def test_integrals_of_a_linear_signal_at_uneven_stamps():

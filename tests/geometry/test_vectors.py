@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.geometry.vectors import cross
+from icalib.geometry.small import cross
 
 
 def test_cross_product_is_numpys_and_broadcasts():

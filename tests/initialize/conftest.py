@@ -13,7 +13,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import LidarStream
 from icalib.geometry import so3
-from icalib.initialize.trajectories.trajectory_fit import ExtrinsicsGuess
+from icalib.initialize.trajectories import ExtrinsicsGuess
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.sensors.lidar.simulate import SimLidar

@@ -12,7 +12,7 @@ from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard, Circles, Target
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.rig import Rig
-from icalib.sensors.camera.initialize.boards.symmetry import resolve_symmetry
+from icalib.sensors.camera.initialize.guess import resolve_symmetry
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

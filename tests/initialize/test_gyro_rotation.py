@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from icalib.geometry import so3
-from icalib.initialize.steps.gyro_rotation import GyroRotation
+from icalib.initialize.rate_correlation import GyroRotation
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_keyframes
 

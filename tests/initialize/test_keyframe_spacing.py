@@ -10,10 +10,10 @@ import pytest
 from icalib.data.measurements import Measurements, PoseStream, WheelStream
 from icalib.geometry import so3
 from icalib.initialize.assumed_motion import MIN_KEYFRAME_SPACING_S, keyframe_spacing
-from icalib.initialize.steps.initializer import SmoothMotion
-from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
+from icalib.initialize.initializer import SmoothMotion
+from icalib.initialize.smooth_trajectory import smooth_trajectory
 from icalib.rig import PoseSensor, Rig, Settings, Wheels, by_name
-from icalib.sensors.pose.initialize.initial_noise import pose_noise
+from icalib.sensors.pose.initialize import pose_noise
 
 TURN, WAY = 2e-3, 1e-3
 DENSITIES = (0.05, 0.2)  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz)

@@ -10,7 +10,7 @@ import pytest
 
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
-from icalib.initialize.trajectories.trajectory_fit import ExtrinsicsGuess
+from icalib.initialize.trajectories import ExtrinsicsGuess
 from icalib.sensors.parameter import Mode, Parameter
 from icalib.tools.simulation import rig_for
 

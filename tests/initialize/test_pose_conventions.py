@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.estimate.problem.inputs import inputs_for
+from icalib.estimate.inputs import inputs_for
 from icalib.optim.state import State
-from icalib.sensors.pose.initialize.extrinsics import pose_values, state_from_poses
+from icalib.sensors.pose.initialize import pose_values, state_from_poses
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.estimate.problem.inputs import inputs_for
+from icalib.estimate.inputs import inputs_for
 from icalib.optim.state import State
 from icalib.sensors.parameter import Parameter, fixed
-from icalib.sensors.pose.initialize.extrinsics import pose_rates, pose_values, state_from_poses
+from icalib.sensors.pose.initialize import pose_rates, pose_values, state_from_poses
 from icalib.sensors.pose.residual import FRAME, frame_of
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate

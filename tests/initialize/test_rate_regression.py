@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.initialize.steps.rate_correlation import SensorRates
-from icalib.initialize.steps.rate_regression import MIN_REGRESSION_SCORE, best_regressions, no_match_error
+from icalib.initialize.hand_eye import MIN_REGRESSION_SCORE, best_regressions, no_match_error
+from icalib.initialize.rate_correlation import SensorRates
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
-from icalib.tools.simulation.sensors.imu import rotation_from_vector
+from icalib.tools.simulation.motion import rotation_from_vector
 
 M = rotation_from_vector(np.array([0.4, -1.1, 0.7])) @ np.diag([0.4, 0.4, 1.0])  # a lens far too long
 OFFSET = 12.3

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.initialize.steps.smooth_trajectory import (
+from icalib.initialize.smooth_trajectory import (
     MIN_HALF_WINDOW_S,
     rate_window,
     rotation_noise,

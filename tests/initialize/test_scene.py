@@ -9,10 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.geometry.cameras import camera_model
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
 from icalib.sensors.camera.corner_factor import Views
-from icalib.sensors.camera.initialize.boards.incremental_scene import place_bodies
-from icalib.sensors.camera.initialize.boards.target_scene import scene_poses, view_poses
+from icalib.sensors.camera.initialize.target_scene import place_bodies, scene_poses, view_poses
+from icalib.sensors.camera.model import choose_bodies, restrict
 from icalib.tools.simulation import simulate, tag_map
 
 

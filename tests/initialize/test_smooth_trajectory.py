@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.initialize.steps.smooth_trajectory import smooth_trajectory
+from icalib.initialize.smooth_trajectory import smooth_trajectory
 
 TURN = np.array([0.3, -1.2, 2.0])  # rad/s
 

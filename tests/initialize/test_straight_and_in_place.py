@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import ImuStream
-from icalib.initialize.steps.rate_alignment import align_rates
-from icalib.initialize.steps.rate_correlation import SensorRates
-from icalib.initialize.trajectories.lever_arm_rows import system_from_trajectory, unexplained_displacement
+from icalib.initialize.rate_alignment import align_rates
+from icalib.initialize.rate_correlation import SensorRates
+from icalib.initialize.trajectories import system_from_trajectory, unexplained_displacement
 from icalib.motion.imu_data import ImuData
 from icalib.sensors.imu.spec import class_noise
 

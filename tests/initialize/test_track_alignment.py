@@ -10,7 +10,7 @@ import pytest
 
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
-from icalib.sensors.camera.initialize.tracks import from_tracks
+from icalib.sensors.camera.initialize import from_tracks
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "paper"

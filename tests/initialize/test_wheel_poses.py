@@ -11,7 +11,7 @@ import pytest
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
-from icalib.sensors.wheels.initialize.relative_pose_guess import extrinsics_guess, intervals_inside, poses_offset
+from icalib.sensors.wheels.initialize import extrinsics_guess, intervals_inside, poses_offset
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, simulate
 

@@ -19,8 +19,7 @@ from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig.file import load_rig, load_target
 from icalib.sensors.imu.spec import class_imperfections
-from icalib.tools.inspection import inspect_recording
-from icalib.tools.inspection.draft import draft_rig
+from icalib.tools.inspection import draft_rig, inspect_recording
 
 SIZE = (32, 24)
 K = (40.5, 41.5, 15.25, 11.75)

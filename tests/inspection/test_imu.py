@@ -11,8 +11,8 @@ import pytest
 from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
-from icalib.sensors.imu.inspect.readings import imu_facts
-from icalib.sensors.imu.read.gravity_turns import gravity_spread
+from icalib.sensors.imu.inspect import imu_facts
+from icalib.sensors.imu.read.cleaning import gravity_spread
 from icalib.tools.inspection import inspect_recording
 from icalib.tools.simulation import handheld, simulate
 

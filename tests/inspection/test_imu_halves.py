@@ -9,16 +9,15 @@ import pytest
 
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import open_recording
-from icalib.data.stamps.jumps import ClockJumps
+from icalib.data.stamps import ClockJumps
 from icalib.errors import EstimationError, RecordingError
 from icalib.rig import ImuSensor, TableLayout, TwoSources
-from icalib.sensors.imu.inspect.draft import imu_lines
+from icalib.sensors.imu.inspect import imu_lines
 from icalib.sensors.imu.read import read_imu
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise
 from icalib.tools.allan.analysis import study_recording
-from icalib.tools.inspection import inspect_recording
-from icalib.tools.inspection.draft import draft_rig
+from icalib.tools.inspection import draft_rig, inspect_recording
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 HALVES = TwoSources("/d435/gyro/sample", "/d435/accel/sample")

@@ -16,13 +16,13 @@ from rich.console import Console
 from icalib.cli import main
 from icalib.data.recordings import FolderRecording, TopicInfo
 from icalib.geometry.targets import AprilGrid, Markers, Target
+from icalib.sensors.camera.inspect import empty_borders
 from icalib.sensors.camera.inspect.facts import CameraSource, camera_views, coverage, target_view
-from icalib.sensors.camera.inspect.findings import empty_borders
 from icalib.tools.inspection import Inspection, inspect_recording, read_target
 from icalib.tools.inspection.console import print_inspection
-from icalib.tools.inspection.findings import findings
+from icalib.tools.inspection.facts import findings
 from icalib.tools.simulation import Imaging, Renderer, Sheet
-from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.scenario import SimCamera
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "euroc"
 SIZE = (320, 240)

@@ -7,8 +7,8 @@ import re
 
 import pytest
 
+from icalib.data.messages import message_types
 from icalib.data.recordings import TopicInfo
-from icalib.data.topics import message_types
 from icalib.sensors.camera.inspect.facts import CameraSource
 from icalib.tools.inspection import find_sources
 

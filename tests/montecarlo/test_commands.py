@@ -15,9 +15,9 @@ from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.batch import program
 from icalib.tools.montecarlo import study as study_module
-from icalib.tools.montecarlo.console import table
 from icalib.tools.montecarlo.record import RunRecord
 from icalib.tools.montecarlo.reproduce import FOLDER, MOTIONS
+from icalib.tools.montecarlo.study import table
 from icalib.tools.montecarlo.summary import block_row, summarise
 from icalib.tools.simulation import load_scenario
 

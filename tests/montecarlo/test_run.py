@@ -13,13 +13,12 @@ from icalib.data.measurements import Measurements
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, RowResiduals, Visited, by_key
-from icalib.sensors.camera.record import CornerResiduals
-from icalib.sensors.lidar.record import LidarResiduals
+from icalib.sensors.camera.stream import CornerResiduals
 from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.lidar.stream import LidarResiduals
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo import one_run
-from icalib.tools.montecarlo.one_run import PlanesKind, RunTask, compare, error, run, true_value, whiteness
-from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo import record as one_run
+from icalib.tools.montecarlo.record import PlanesKind, RunRecord, RunTask, compare, error, run, true_value, whiteness
 from icalib.tools.simulation import (
     HandheldMotion,
     Room,

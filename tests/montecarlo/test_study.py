@@ -18,7 +18,7 @@ from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
 from icalib.tools.montecarlo import RunRecord, RunTask, Study, StudyPlan, run_study
 from icalib.tools.montecarlo import study as study_module
-from icalib.tools.montecarlo.store import Identity, RunStore
+from icalib.tools.montecarlo.record import Identity, RunStore
 from icalib.tools.montecarlo.study import run_all
 from icalib.tools.simulation import Scenario, handheld
 
@@ -151,7 +151,7 @@ def test_runs_of_another_study_are_never_mixed_in(alone: Path, changed: dict, wh
 
 
 def test_another_icalib_is_another_study(alone: Path, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("icalib.tools.montecarlo.store.program", lambda: "another")
+    monkeypatch.setattr("icalib.tools.montecarlo.record.program", lambda: "another")
     with pytest.raises(CalibrationError, match="icalib changed"):
         study(alone)
     store = RunStore(tmp_path, Identity.of("handheld", "digest", "none", "known"))

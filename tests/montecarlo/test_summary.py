@@ -9,14 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.tools.montecarlo.page import study_html
-from icalib.tools.montecarlo.record import RunRecord, Size, from_json, to_json
-from icalib.tools.montecarlo.store import Identity
+from icalib.tools.montecarlo.record import Identity, RunRecord, Size, from_json, to_json
 from icalib.tools.montecarlo.summary import (
     Consistency,
     answer,
     consistency_json,
     largest_words,
+    study_html,
     summarise,
     unobservable_words,
     verdict_words,

@@ -12,20 +12,19 @@ from tests.typed import not_none
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
-from icalib.initialize.steps.rate_correlation import closest_of_equals
-from icalib.initialize.steps.single_recording import KnownExtrinsics
+from icalib.initialize.initializer import KnownExtrinsics
+from icalib.initialize.rate_correlation import closest_of_equals
 from icalib.motion.imu_data import ImuData
-from icalib.motion.sweep import EstimatedMotion
+from icalib.motion.poses import EstimatedMotion
 from icalib.optim.state import State
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.position.frame import PositionFrame
-from icalib.sensors.position.initialize import KnownPlace, place
+from icalib.sensors.position.initialize import KnownPlace, motion_from_fixes, place
 from icalib.sensors.position.initialize.attitude import Fix
-from icalib.sensors.position.initialize.with_imu import motion_from_fixes
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation import Drive, Room, Scenario, simulate
-from icalib.tools.simulation.scenario.room import hills_of_slope
+from icalib.tools.simulation.room import hills_of_slope
 
 ARM = np.array([0.4, -0.25, 0.6])
 FRAME_YAW, ORIGIN = 2.1, np.array([3.0, -1.0, 0.5])

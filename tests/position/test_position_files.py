@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from tests.typed import instance, not_none
 
+from icalib.data.recording import Reading
 from icalib.data.recordings import open_recording
-from icalib.data.recordings.base import Reading
 from icalib.errors import RecordingError
 from icalib.rig import Rig, by_name
 from icalib.sensors.position.read import checked_positions, read
-from icalib.sensors.position.read.fixes import FIX_TYPES
-from icalib.sensors.position.read.readings import (
+from icalib.sensors.position.read.fixes import (
     AS_RECORDED,
+    FIX_TYPES,
     NO_COVARIANCE,
     PositionReadings,
     about_first,
@@ -24,9 +24,9 @@ from icalib.sensors.position.read.readings import (
     from_geodetic,
     good_fixes,
     left_out,
+    read_pos,
     read_position_table,
 )
-from icalib.sensors.position.read.rtklib import read_pos
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TableLayout

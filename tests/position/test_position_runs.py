@@ -18,7 +18,7 @@ from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation import Drive, Room, Scenario, Simulation, rig_for, simulate
-from icalib.tools.simulation.scenario.room import hills_of_slope
+from icalib.tools.simulation.room import hills_of_slope
 
 pytestmark = pytest.mark.slow
 

@@ -8,12 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.data import topics
+from icalib.data import messages as topics
+from icalib.data import tables as files
+from icalib.data.messages import MessageType, message_types
 from icalib.data.recordings import FolderRecording, open_recording
-from icalib.data.tables import table as files
-from icalib.data.tables.columns import STAMP, TableKind
-from icalib.data.tables.table import TableFile, read_table, table_files
-from icalib.data.topics import MessageType, message_types
+from icalib.data.tables import STAMP, TableFile, TableKind, read_table, table_files
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.pose import read as pose
 

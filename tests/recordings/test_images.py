@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from icalib.data.images.images import file_payload, file_size
+from icalib.data.images import file_payload, file_size
 from icalib.data.recordings import DamagedImageError, Payload, decode
 from icalib.errors import RecordingError
 

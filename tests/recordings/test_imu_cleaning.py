@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps.even import EvenStamps, even_stamps, followed
-from icalib.sensors.imu.read.checks import checked_imu
+from icalib.data.stamps import EvenStamps, even_stamps, followed
+from icalib.sensors.imu.read import checked_imu
 from icalib.tools.simulation import handheld, simulate
 
 

@@ -12,9 +12,9 @@ from tests.typed import random_rotations
 from icalib.data.messages import read_poses, read_twists
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
-from icalib.sensors.camera.read.camera_info import read_camera_info
+from icalib.sensors.camera.read import read_camera_info
 from icalib.sensors.lidar.read.point_clouds import point_clouds
-from icalib.sensors.wheels.read.joints import read_joints
+from icalib.sensors.wheels.read import read_joints
 
 RNG = np.random.default_rng(11)
 STAMPS = [1_700_000_000_123_456_789 + k * 10_000_000 for k in range(5)]

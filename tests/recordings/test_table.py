@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from icalib.data.tables.columns import TableKind
-from icalib.data.tables.table import read_table
+from icalib.data.tables import TableKind, read_table
 from icalib.errors import RecordingError
 
 INTEGERS, DECIMALS = ("t [ns]", "id"), ("u", "v")

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from icalib.data.folder import FolderRecording
 from icalib.data.recordings import BagRecording
-from icalib.data.recordings.folder import FolderRecording
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import PoseSensor

@@ -25,10 +25,10 @@ from icalib.result import (
 )
 from icalib.rig import Camera, ImuNoise, ImuSensor, Lidar, Parameter, Rig, Settings, Wheels, by_name
 from icalib.rig.file import rig_to_dict
-from icalib.sensors.camera.record import CornerResiduals
-from icalib.sensors.imu.record import ImuResiduals
+from icalib.sensors.camera.stream import CornerResiduals
 from icalib.sensors.imu.spec import INTRINSICS_LABELS
-from icalib.sensors.lidar.record import LidarResiduals
+from icalib.sensors.imu.stream import ImuResiduals
+from icalib.sensors.lidar.stream import LidarResiduals
 
 N_KEYFRAMES, CORNERS_PER_IMAGE = 300, 34
 POSES = {

@@ -12,9 +12,8 @@ from tests.typed import not_none
 from icalib.export.formats import export
 from icalib.geometry import so3
 from icalib.result import Calibration
-from icalib.result.body_frame import in_body_frame
-from icalib.result.quantities import rows
-from icalib.result.summary import calibration_yaml
+from icalib.result.quantities import in_body_frame, rows
+from icalib.result.saving import calibration_yaml
 
 STEP = 1e-6
 

@@ -16,8 +16,8 @@ import yaml
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, ParameterGroup, by_key, load_calibration
 from icalib.result.calibration import RecordingSpan
-from icalib.result.summary import calibration_yaml
-from icalib.validation.misfit import scatter_warnings
+from icalib.result.saving import calibration_yaml
+from icalib.validation.causes import scatter_warnings
 
 
 @pytest.fixture

@@ -22,11 +22,9 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.result.as_rig import rig_of_result
+from icalib.result.saving import rig_of_result
 from icalib.rig.file import rig_to_dict
-from icalib.tools.check import Check, check_measurements, with_places
-from icalib.tools.check.check import joint_limit
-from icalib.tools.check.words import lines, verdict
+from icalib.tools.check import Check, check_measurements, joint_limit, lines, verdict, with_places
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 pytestmark = pytest.mark.slow

@@ -17,14 +17,21 @@ from scipy.stats import chi2, norm
 from icalib.cli import main
 from icalib.export.formats import export
 from icalib.result import Calibration, Verdict, relative_pose
+from icalib.sensors.fields import parameter_to_plain
 from icalib.sensors.parameter import fixed
-from icalib.sensors.parameter_fields import parameter_to_plain
-from icalib.tools.comparison.compare import Comparison, ComparisonTolerances, Difference, compare_sides
+from icalib.tools.comparison.compare import (
+    Comparison,
+    ComparisonTolerances,
+    Difference,
+    Side,
+    chi2_above,
+    compare_sides,
+    lines,
+    sentence,
+    side_of_result,
+    sigmas,
+)
 from icalib.tools.comparison.reading import compare_files
-from icalib.tools.comparison.results import side_of_result
-from icalib.tools.comparison.sides import Side
-from icalib.tools.comparison.significance import chi2_above, sigmas
-from icalib.tools.comparison.words import lines, sentence
 
 NOISE = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
 

@@ -23,7 +23,7 @@ from icalib.errors import CalibrationError
 from icalib.export.common import guesses, quaternion
 from icalib.export.formats import FORMATS, export
 from icalib.geometry.cameras import camera_model
-from icalib.motion.imu_model import correction_matrices
+from icalib.motion.imu_data import correction_matrices
 from icalib.result import Calibration, ParameterGroup
 from icalib.sensors.imu.spec import INTRINSICS_LABELS
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from icalib.errors import CalibrationError
 from icalib.export.kalibr import camchain, imu_yaml
 from icalib.geometry.cameras import camera_model
-from icalib.motion.imu_model import correction_matrices
+from icalib.motion.imu_data import correction_matrices
 from icalib.result import Calibration, ParameterGroup, by_key
 from icalib.sensors.imu.spec import INTRINSICS_LABELS
 

@@ -12,12 +12,10 @@ from tests.allan.test_allan import at_rest
 
 from icalib.base.files import printable
 from icalib.cli import main
-from icalib.export.formats import export
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import export, write_outputs
 from icalib.result import Calibration, load_calibration
 from icalib.tools.allan import study_imu, write_study
-from icalib.tools.fleet.inputs import InputHashes
-from icalib.tools.fleet.jobs import Job
+from icalib.tools.fleet.result import InputHashes, Job
 
 ODD = os.fsdecode(b"B\xfcro")
 

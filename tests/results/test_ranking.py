@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.observability.cause import Cause
+from icalib.observability.determination import Cause
 from icalib.result import SensorFit
-from icalib.sensors.camera.assess.exposure_lag import image_velocity
-from icalib.validation.causes import Misfit, explaining, ranked
-from icalib.validation.misfit import are_noise
+from icalib.sensors.camera.assess import image_velocity
+from icalib.validation.causes import Misfit, are_noise, explaining, ranked
 
 
 def fits(*ratios: float) -> list[SensorFit]:

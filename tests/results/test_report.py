@@ -16,10 +16,10 @@ import yaml
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-from icalib.export.outputs import check_folder, write_outputs
+from icalib.export.formats import check_folder, write_outputs
 from icalib.report import report_html
 from icalib.report.console import legend, lens_words, relative_words, shown_rows, table
-from icalib.report.plot import numbers, thin
+from icalib.report.figures import numbers, thin
 from icalib.result import (
     Calibration,
     ProjectionMap,
@@ -29,10 +29,9 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.result.excess import excess, largest_dof
-from icalib.result.quantities import TURNS, chi2_words, dof_words, format_number, rows, rpy_deg
-from icalib.result.summary import calibration_yaml
-from icalib.sensors.camera.show import image_figures, projection_figures
+from icalib.result.quantities import TURNS, chi2_words, dof_words, excess, format_number, largest_dof, rows, rpy_deg
+from icalib.result.saving import calibration_yaml
+from icalib.sensors.camera import show
 
 VOID = {"meta", "link", "br", "img", "hr"}
 FIGURES = {"rig", "histogram", "imu-residuals", "trajectory", "motion", "convergence", "correlation", "held-out"} | {
@@ -111,8 +110,8 @@ def test_a_long_recording_stays_small(calibration: Calibration):
         name: np.concatenate([getattr(r, name)] * n)
         for name in ("seconds", "point", "uv", "residual", "sigma", "rejected")
     }
-    figure = image_figures.residuals_over_time(dataclasses.replace(r, start=start, **long))
-    assert all(len(trace["x"]) <= image_figures.MOST_DOTS for trace in figure["data"])
+    figure = show.residuals_over_time(dataclasses.replace(r, start=start, **long))
+    assert all(len(trace["x"]) <= show.MOST_DOTS for trace in figure["data"])
     assert len(json.dumps(figure)) < 300_000
 
 
@@ -168,7 +167,7 @@ def test_maps_of_projection_say_what_they_show(calibration: Calibration, text: s
     assert m is not None
     np.testing.assert_allclose(drawn[0]["z"], m.sigma, rtol=1e-4)
     assert drawn[0]["zmax"] <= 6.0 * m.median_seen and drawn[0]["contours"]["size"] <= drawn[0]["zmax"] / 9
-    assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= projection_figures.MOST_RESIDUAL_DOTS
+    assert drawn[1]["name"] == "corners" and 500 < len(drawn[1]["x"]) <= show.MOST_RESIDUAL_DOTS
     size, u, v = m.worst
     assert (
         f"Known to {format_number(m.median_seen)} px where it saw points (median), to {format_number(size)} px"
@@ -193,7 +192,7 @@ def test_a_fixed_lens_has_no_map_but_a_sentence(calibration: Calibration):
 def test_what_is_said_of_an_edge_without_data(seen: bool, sentence: str):
     sigma, cells = np.array([[0.1, 0.1, 0.9]]), np.array([[seen, seen, False]])
     m = ProjectionMap("cam0", np.inf, np.array([0.0, 10.0, 20.0]), np.zeros(1), sigma, cells)
-    found = projection_figures.map_words(m)
+    found = show.map_words(m)
     assert sentence in found and "0.10 px" in found and "0.90 px at the worst, at pixel (20, 0)" in found
     assert ("Let it see" in found) == seen
 

@@ -13,7 +13,7 @@ from icalib.cli import main
 from icalib.errors import RigError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.result.as_rig import TREATMENTS, Treatment, rig_of_result
+from icalib.result.saving import TREATMENTS, Treatment, rig_of_result
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
 from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation import handheld, rig_for, simulate

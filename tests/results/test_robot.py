@@ -17,13 +17,13 @@ from scipy.spatial.transform import Rotation
 
 from icalib.cli.console import print_result
 from icalib.errors import CalibrationError
-from icalib.export.outputs import write_outputs
-from icalib.report import report_html, sections
+from icalib.export.formats import write_outputs
+from icalib.report import page, report_html
 from icalib.result import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.result.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
 from icalib.sensors.lidar import show
-from icalib.validation import misfit
+from icalib.validation import causes
 
 ROBOT_FIGURES = {"points-0", "distance-0", "wheels-0", "map-before", "map-after"}
 
@@ -233,15 +233,15 @@ def warnings(
 ) -> str:
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
     rig = Rig(by_name(imu, Lidar("lidar0", "lidar0", noise), Wheels("wheel0", "wheel0", **wheels)))
-    return misfit.misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
+    return causes.misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
 
 
 def test_kinds_without_views_and_words_of_their_own_get_general_ones(
     robot: Calibration, monkeypatch: pytest.MonkeyPatch
 ):
-    for module in (sections, misfit):
+    for module in (page, causes):
         monkeypatch.setattr(module, "facet", lambda kind, name: None)
-    (section,) = sections.sections(robot)
+    (section,) = page.sections(robot)
     assert (section.name, section.title) == ("wheels", "Wheels")
     assert [t["name"] for t in section.figures["wheels-0"]["data"]] == ["left", "right", "lateral", "vertical"]
     words = "yaw residuals of wheel0 are 2x larger than its stated noise predicts"

@@ -19,8 +19,8 @@ from icalib.result import (
     projection_uncertainty,
     working_distance,
 )
-from icalib.sensors.camera.record import TrackResiduals
-from icalib.tools.montecarlo.one_run import whiteness
+from icalib.sensors.camera.stream import TrackResiduals
+from icalib.tools.montecarlo.record import whiteness
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ import pytest
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
-from icalib.sensors.camera.assess.twin_lenses import twin_lens
+from icalib.sensors.camera.assess.lenses import twin_lens
 from icalib.tools.simulation import load_scenario, rig_for, simulate
 
 LENS = np.array([180.0, 181.0, 325.0, 238.0, -0.2, 0.55])

@@ -16,7 +16,7 @@ from urdf_parser_py.urdf import URDF
 from icalib.cli import main
 from icalib.errors import CalibrationError
 from icalib.export.formats import export
-from icalib.export.urdf import read_urdf
+from icalib.export.ros import read_urdf
 from icalib.result import Calibration
 
 ROBOT = """\

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from icalib.optim.prior_factor import Prior, variance_of_priors
+from icalib.optim.arrowhead import Prior, variance_of_priors
 from icalib.optim.state import Block, State
-from icalib.validation.variance_parts import VarianceParts
+from icalib.validation.assess import VarianceParts
 
 NOTHING = np.zeros(0)
 

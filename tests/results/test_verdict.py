@@ -229,7 +229,7 @@ def test_the_exit_code_of_strict(
     """Without --strict 0, whatever the verdict; with it that of the verdict. The board's shape is printed by -v."""
     rig = tmp_path / "rig.yaml"
     rig.write_text((Path(__file__).parents[2] / "examples" / "euroc" / "rig.yaml").read_text())
-    monkeypatch.setattr("icalib.export.outputs.write_outputs", lambda *_: None)
+    monkeypatch.setattr("icalib.export.formats.write_outputs", lambda *_: None)
     command = ["calibrate", str(rig), str(tmp_path / "run"), "-o", str(tmp_path / "out"), *flags]
     for name in ("usable", "usable with care: weak", "partly usable", "not usable: wrong"):
         monkeypatch.setattr("icalib.pipeline.calibrate", lambda *_, c=cases[name], **__: c)

@@ -18,7 +18,7 @@ from icalib.rig import Ground
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate
-from icalib.tools.simulation.tables import write_tables
+from icalib.tools.simulation.writing import write_tables
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"
 ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.sensors.camera.assess.wrong_resolution import smaller_image
+from icalib.sensors.camera.assess.lenses import smaller_image
 
 CENTRE = np.array([375.5, 239.5])  # of images of 752 x 480 px
 STD = np.array([1.0, 1.0])

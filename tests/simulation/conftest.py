@@ -11,7 +11,7 @@ from tests.typed import not_none
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Drive, Features, Obstacle, Room, Scenario, SimCamera, hills_of_slope
-from icalib.tools.simulation.scenario.robot import DriveKind
+from icalib.tools.simulation.trajectory import DriveKind
 
 CAMERA_AXES = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # R_imu_cam of one that looks ahead
 

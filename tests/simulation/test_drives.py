@@ -12,7 +12,7 @@ from tests.typed import not_none
 from icalib.errors import RecordingError, RigError
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Drive, Room, hills_of_slope, simulate
-from icalib.tools.simulation.scenario.jets import Jet
+from icalib.tools.simulation.trajectory import Jet
 
 from .conftest import alone, on_ground, turn, wheel_path
 

@@ -7,8 +7,7 @@ import pytest
 from tests.typed import not_none
 
 from icalib.tools.simulation import handheld, simulate
-from icalib.tools.simulation.sensors.imu import ideal_readings
-from icalib.tools.simulation.sensors.motion import Reference
+from icalib.tools.simulation.motion import Reference, ideal_readings
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 KINDS = ("handheld", "planar", "single_axis", "motionless")

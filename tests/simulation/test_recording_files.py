@@ -10,9 +10,9 @@ import yaml
 from tests.typed import instance, not_none
 
 from icalib.cli import main
+from icalib.data.bag_recording import BagRecording
 from icalib.data.measurements import ImuStream, WheelPoses
 from icalib.data.recordings import open_recording
-from icalib.data.recordings.bag import BagRecording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import ImuSensor
@@ -21,7 +21,7 @@ from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.lidar.read.point_clouds import point_clouds
 from icalib.sensors.lidar.simulate import SimLidar
-from icalib.sensors.wheels.read.joints import read_joints
+from icalib.sensors.wheels.read import read_joints
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import ADIS16448, handheld, rig_for, simulate, write_sensors, write_tables
 
@@ -123,7 +123,7 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
 @pytest.mark.parametrize("name", ["run", "run.bag"])
 def test_bags_hold_what_the_drivers_send(simulation, tmp_path, name, monkeypatch):
     pytest.importorskip("cv2")
-    monkeypatch.setattr("icalib.tools.simulation.sensor_bag._AT_A_TIME", 70)
+    monkeypatch.setattr("icalib.tools.simulation.writing._AT_A_TIME", 70)
     write_sensors(simulation, 3, tmp_path / name)
     bag, measured = BagRecording(tmp_path / name), simulation.measurements
     imu = imu_readings(bag, ImuSensor("imu0", "", ADIS16448))
@@ -185,7 +185,7 @@ def test_nothing_is_left_of_a_recording_that_fails(simulation, tmp_path, monkeyp
     def full(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("icalib.tools.simulation.tables.np.savez", full)
+    monkeypatch.setattr("icalib.tools.simulation.writing.np.savez", full)
     for write in (write_tables, write_sensors):
         with pytest.raises(RecordingError, match="run cannot be written \\(No space left on device\\)"):
             write(replace(simulation, scenario=replace(simulation.scenario, board=False)), 3, tmp_path / "run")

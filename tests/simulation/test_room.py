@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from icalib.tools.simulation import hills_of_slope
-from icalib.tools.simulation.scenario.room import distances
+from icalib.tools.simulation.room import distances
 
 
 def met(room, origin, direction):

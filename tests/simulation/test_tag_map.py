@@ -10,7 +10,7 @@ import pytest
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Markers, Scene
 from icalib.tools.simulation import Imaging, film, handheld, simulate, tag_map
-from icalib.tools.simulation.scenario.projection import project
+from icalib.tools.simulation.projection import project
 
 
 def tags_seen(sim, camera: int) -> np.ndarray:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.tools.view.recorded import CubicPath
-from icalib.tools.view.stream import by_value
+from icalib.tools.view import CubicPath, by_value
 
 
 def _pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

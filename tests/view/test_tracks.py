@@ -11,7 +11,7 @@ import pytest
 from icalib.cli import main
 from icalib.pipeline import calibrate_measurements
 from icalib.result import by_key
-from icalib.sensors.camera.record import TrackResiduals, rms_of_images
+from icalib.sensors.camera.stream import TrackResiduals, rms_of_images
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"

@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from icalib.cli import main
-from icalib.report.ellipsoids import ellipsoids, magnification
+from icalib.report.rig_figures import ellipsoids, magnification
 from icalib.result import Calibration, ParameterGroup, RowResiduals, by_key
-from icalib.tools.view import recorded, view
+from icalib.tools import view as recorded
+from icalib.tools.view import view
 
 IMAGE = "world/imu0/cam0/image"
 MOST_OFF_M = 0.006  # five sigma of the LiDAR's position; 10 ms of time offset are 10 mm, a scan's 0.1 s are 100 mm

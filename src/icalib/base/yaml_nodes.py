@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import chain
 from math import inf
@@ -12,8 +14,7 @@ from typing import Any, NoReturn
 import numpy as np
 import yaml
 
-from icalib.base.input_files import regular
-from icalib.base.suggestion import suggestion
+from icalib.base.files import regular
 from icalib.errors import RigError
 
 LARGEST_INTEGER = 2**63 - 1  # largest int64, the type of timestamps
@@ -230,3 +231,15 @@ def _reason(error: Exception) -> str:
 def _new_values(former: str) -> str:
     """Advice on renamed values of a renamed field, for its error message; mostly empty."""
     return ", and write interval-mean for mean, instantaneous for instant" if former == "meaning" else ""
+
+
+# Suggestion of a similar valid name for a misspelt one.
+
+ALIKE = 0.6  # least similarity of two names by difflib, 0 to 1; lower values suggest less similar names
+
+
+def suggestion(name: str, valid: Iterable[str]) -> str:
+    """End of a message: ", did you mean 'x'", x being the most similar valid name regardless of case; empty if none."""
+    by_lower = {v.lower(): v for v in valid}
+    near = difflib.get_close_matches(name.lower(), by_lower, n=1, cutoff=ALIKE)
+    return f", did you mean {by_lower[near[0]]!r}" if near else ""

@@ -8,7 +8,7 @@ from math import inf
 from pathlib import Path
 from typing import Any, NoReturn
 
-from icalib.base.suggestion import suggestion
+from icalib.base.yaml_nodes import suggestion
 
 _CHOICES = re.compile(r"invalid choice: (?P<given>'[^']*'|\S+) \(choose from (?P<choices>.*)\)", re.DOTALL)
 

@@ -12,8 +12,7 @@ import warnings
 from pathlib import Path
 
 from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, file_path, nonnegative_int
-from icalib.cli.result_commands import add_result_commands
-from icalib.cli.target_command import add_target_command
+from icalib.cli.result_commands import add_result_commands, add_target_command
 from icalib.errors import CalibrationError
 
 
@@ -229,8 +228,8 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 def _calibrate(options: argparse.Namespace) -> int:
     import dataclasses
 
-    from icalib.cli.console import print_result, print_warnings, progress_bar
-    from icalib.export.outputs import check_folder, write_outputs
+    from icalib.cli.console import console_progress, print_result, print_warnings
+    from icalib.export.formats import check_folder, write_outputs
     from icalib.pipeline import calibrate
     from icalib.result.verdict import EXIT_CODES
     from icalib.rig.file import load_rig
@@ -241,7 +240,7 @@ def _calibrate(options: argparse.Namespace) -> int:
         raise CalibrationError("--segments must be 0 (none) or at least 2 segments.")
     rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
     check_folder(options.output, [options.rig, *options.recording])
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         result = calibrate(rig, options.recording, progress, start_s=options.start_s, end_s=options.end_s)
         progress("writing", 0.97)
         write_outputs(result, options.output)
@@ -253,14 +252,14 @@ def _calibrate(options: argparse.Namespace) -> int:
 
 
 def _simulate(options: argparse.Namespace) -> None:
-    from icalib.cli.console import progress_bar
+    from icalib.cli.console import console_progress
     from icalib.tools.simulation import load_scenario, simulate, write_sensors, write_tables
-    from icalib.tools.simulation.tables import check_absent
+    from icalib.tools.simulation.writing import check_absent
 
     scenario = load_scenario(options.scenario)
     seed = scenario.seed if options.seed is None else options.seed
     check_absent(options.output)
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         simulation = simulate(scenario, seed, lambda stage, done: progress(stage, 0.6 * done))
         write = write_tables if options.level == "data" else write_sensors
         notes = write(simulation, seed, options.output, lambda done: progress("writing", 0.6 + 0.4 * done))
@@ -271,25 +270,25 @@ def _simulate(options: argparse.Namespace) -> None:
 
 
 def _montecarlo(options: argparse.Namespace) -> None:
-    from icalib.cli.console import progress_bar
+    from icalib.cli.console import console_progress
     from icalib.tools.montecarlo import StudyPlan, run_file
-    from icalib.tools.montecarlo.console import print_study
+    from icalib.tools.montecarlo.study import print_study
 
     plan = StudyPlan(options.runs, options.seed, options.guess, options.planes, options.workers, options.scheduler)
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         study = run_file(options.scenario, options.output, plan, progress)
     if not options.quiet:
         print_study(study, options.output)
 
 
 def _reproduce(options: argparse.Namespace) -> None:
-    from icalib.cli.console import progress_bar
+    from icalib.cli.console import console_progress
     from icalib.tools.montecarlo import StudyPlan
-    from icalib.tools.montecarlo.console import print_study
     from icalib.tools.montecarlo.reproduce import reproduce
+    from icalib.tools.montecarlo.study import print_study
 
     plan = StudyPlan(options.runs, guess="drawn", workers=options.workers, scheduler=options.scheduler)
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         studies = reproduce(options.output, plan, progress)
     if not options.quiet:
         for motion, study in studies.items():
@@ -298,13 +297,13 @@ def _reproduce(options: argparse.Namespace) -> None:
 
 
 def _fleet(options: argparse.Namespace) -> int:
-    from icalib.cli.console import progress_bar
+    from icalib.cli.console import console_progress
     from icalib.tools.fleet import Crew, run_fleet
-    from icalib.tools.fleet.console import print_fleet
+    from icalib.tools.fleet.run import print_fleet
 
     crew = Crew(options.workers, options.scheduler)
     say = (lambda sentence: None) if options.quiet else print
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         fleet = run_fleet(options.jobs, options.output, crew, options.sigma, progress, say)
     if not options.quiet:
         print_fleet(fleet, options.output)
@@ -313,7 +312,7 @@ def _fleet(options: argparse.Namespace) -> int:
 
 def _inspect(options: argparse.Namespace) -> None:
     from icalib.base.files import refuse_existing, refuse_foreign, write_new, write_sealed
-    from icalib.cli.console import progress_bar
+    from icalib.cli.console import console_progress
     from icalib.tools.inspection import draft_rig, inspect_recording, read_target
     from icalib.tools.inspection.console import figures_json, print_inspection
 
@@ -327,7 +326,7 @@ def _inspect(options: argparse.Namespace) -> None:
             )
         refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
-    with progress_bar(options.quiet) as progress:
+    with console_progress(options.quiet) as progress:
         inspection = inspect_recording(
             options.recording, target, progress, start_s=options.start_s, end_s=options.end_s
         )

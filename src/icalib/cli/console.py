@@ -6,7 +6,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from html import escape
+from importlib import import_module
+from math import inf
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -29,7 +33,7 @@ VERDICT_STYLES: dict[Usability, str] = {
 
 
 @contextmanager
-def progress_bar(quiet: bool) -> Iterator[Callable[[str, float], None]]:
+def console_progress(quiet: bool) -> Iterator[Callable[[str, float], None]]:
     """Context manager that yields a function to show stage and completed fraction (0 to 1).
 
     It shows a bar on standard error; if that is no terminal, a line at most every 30 s; nothing if `quiet`.
@@ -110,3 +114,41 @@ def print_warnings(calibration: Calibration) -> None:
     """Output of `--quiet` on standard error: reasons and verdict, or nothing if there are no reasons."""
     if calibration.reasons:
         print_verdict(calibration, Console(stderr=True, markup=False))
+
+
+# Progress bar for the Python API, in a terminal or a Jupyter notebook.
+
+EVERY_S = 0.2  # least interval between updates in a notebook
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[str, float], None]]:
+    """Yields the argument `progress` of `icalib.calibrate`: `with icalib.progress_bar() as progress: ...`."""
+    if not in_notebook():
+        with console_progress(quiet=False) as show:
+            yield show
+        return
+    display: Any = import_module("IPython.display")
+    handle, last = display.display(display.HTML(_bar("starting", 0.0)), display_id=True), -inf
+
+    def redraw(stage: str, done: float) -> None:
+        nonlocal last
+        if time.monotonic() - last >= EVERY_S:
+            last = time.monotonic()
+            handle.update(display.HTML(_bar(stage, done)))
+
+    try:
+        yield redraw
+    finally:
+        handle.update(display.HTML(""))
+
+
+def in_notebook() -> bool:
+    """True in a Jupyter kernel, which always imports IPython first."""
+    ipython: Any = sys.modules.get("IPython")
+    shell = None if ipython is None else ipython.get_ipython()
+    return getattr(shell, "kernel", None) is not None
+
+
+def _bar(stage: str, done: float) -> str:
+    return f'<progress value="{done:.3f}" max="1" style="width: 20em"></progress> {escape(stage)}'

@@ -9,19 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from icalib.estimate.problem.assembly import assemble, keyframe_times, keyframes_for, resample
-from icalib.estimate.problem.guess_priors import guess_priors
-from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.problem.outcome import Outcome, Step, Visit, relative_decrease
-from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.solver_options import SolverOptions
-from icalib.estimate.residual_statistics.fit_statistics import chi2_by_kind, fits
-from icalib.model.sensor_model import by_kind
-from icalib.model.statistics import PassEnd
+from icalib.estimate.inputs import Inputs
+from icalib.estimate.problem import Problem, assemble, guess_priors, keyframe_times, keyframes_for, resample
+from icalib.estimate.residual_statistics import chi2_by_kind, fits
+from icalib.estimate.solver import Outcome, SolverOptions, Step, Visit, minimise, relative_decrease
+from icalib.model.sensor_model import PassEnd, by_kind
 from icalib.optim import memory
-from icalib.optim.calib_block import NO_DIRECTIONS
-from icalib.optim.prior_factor import Prior, without_priors
+from icalib.optim.arrowhead import NO_DIRECTIONS, Prior, without_priors
 from icalib.optim.state import State
 
 FIRST_PASS_PRIOR_WIDTH = 3.0  # width of the priors of `first_pass`, over the prior uncertainty of the guess

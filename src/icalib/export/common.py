@@ -16,9 +16,9 @@ from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration, Verdict
-from icalib.result.body_frame import in_body_frame
+from icalib.result.quantities import in_body_frame
 from icalib.result.verdict import TOO_UNCERTAIN
-from icalib.rig.kinds import SENSOR_TYPES
+from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 

@@ -8,27 +8,33 @@ Exports a calibration to a format by its name.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
 
-from icalib.base.files import printable, refuse_foreign, sealed_texts, write_texts
-from icalib.base.suggestion import suggestion
+from icalib.base.files import (
+    check_writable,
+    printable,
+    refuse_foreign,
+    refuse_foreign_set,
+    sealed,
+    sealed_texts,
+    write_files,
+    write_texts,
+)
+from icalib.base.yaml_nodes import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.colmap import colmap
 from icalib.export.common import Export, guessed_poses, guesses, no_place_for, others, quaternion
-from icalib.export.kalibr import camchain, camchain_name, imu_yaml
-from icalib.export.lidar_odometry import fast_lio, fast_livo2, lio_sam
-from icalib.export.openvins import mins, openvins
-from icalib.export.orb_slam3 import orb_slam3
-from icalib.export.ros import autoware, camera_info, ros2_static
-from icalib.export.urdf import updated_urdf, urdf
-from icalib.export.vins_fusion import vins_fusion
-from icalib.result import Calibration
-from icalib.result.summary import body_name, calibration_yaml, pose_key, reference_name
+from icalib.export.kalibr import camchain, camchain_name, imu_yaml, kalibr_texts
+from icalib.export.odometry import fast_lio, fast_livo2, lio_sam, mins, openvins, orb_slam3, vins_fusion
+from icalib.export.ros import autoware, camera_info, ros2_static, updated_urdf, urdf
+from icalib.report import report_html
+from icalib.result import Calibration, calibration_files
+from icalib.result.saving import body_name, calibration_yaml, pose_key, reference_name
 
 FORMATS = (
     "kalibr",
@@ -154,3 +160,33 @@ _PLAIN: dict[str, Callable[[Calibration], Export]] = {
     "colmap": colmap,
     "json": plain_json,
 }
+
+
+# Output folder of a calibration: all files that derive from one result, written as one set.
+
+
+def write_outputs(calibration: Calibration, folder: str | Path) -> None:
+    """Write `output_files` into `folder`: all or none.
+
+    Raises CalibrationError if `folder` cannot be written, or contains files of the same names that icalib did not
+    write.
+    """
+    refuse_foreign_set(Path(folder))
+    write_files(Path(folder), output_files(calibration))
+
+
+def output_files(calibration: Calibration) -> dict[str, bytes]:
+    """Contents of the result files, Kalibr's files (`kalibr_texts`) and the report, by name."""
+    texts = {"report.html": report_html(calibration)}
+    texts |= {name: text(calibration) for name, text in kalibr_texts(calibration).items()}
+    return calibration_files(calibration) | {name: sealed(printable(text).encode()) for name, text in texts.items()}
+
+
+def check_folder(folder: str | Path, inputs: Sequence[Path] = ()) -> None:
+    """Create `folder` and check that it can be written, before the calibration starts.
+
+    Raises CalibrationError if it cannot, or if a file that icalib did not write, or one of `inputs`, would be
+    overwritten.
+    """
+    check_writable(Path(folder))
+    refuse_foreign_set(Path(folder), inputs)

@@ -15,7 +15,7 @@ from icalib.errors import CalibrationError
 from icalib.export.common import CameraParameters, imu_values, inverse, lens_of, restarts, time_offset
 from icalib.geometry import so3
 from icalib.result import Calibration
-from icalib.sensors.camera.record import CornerResiduals, image_of
+from icalib.sensors.camera.stream import CornerResiduals, image_of
 
 # icalib model -> Kalibr's camera and distortion model, and the number of leading icalib distortion coefficients that
 # Kalibr lists as intrinsics before the focal lengths.

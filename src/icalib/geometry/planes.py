@@ -61,3 +61,13 @@ def difference(to: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """(3,) correction d for which `moved(plane, d)` is the plane `to` (6,), to first order."""
     across = tangents(np.ascontiguousarray(plane[:3]))
     return np.append(across @ to[:3], plane[:3] @ (to[3:] - plane[3:]))
+
+
+# Fits of the two edges that meet in a corner of a target, one row for each edge.
+#
+# Columns: first end (2,) and second end (2,) px of the fitted piece, relative to the corner; gain (2,) px^2,
+# derivative of the corner by the curvature of the edge; fitted curvature [1 / px]. The curvature is positive if the
+# piece turns left from the first end to the second, with u to the right and v down.
+
+EDGE = 7  # number of columns
+NO_EDGES = np.zeros((0, 2, EDGE), dtype=np.float32)  # the fits of no corners

@@ -150,3 +150,94 @@ def eigen3(A, values, vectors):
             values[i], values[j] = values[j], values[i]
             for k in range(3):
                 vectors[k, i], vectors[k, j] = vectors[k, j], vectors[k, i]
+
+
+# Cross products of many vectors, and a comparison of vectors.
+#
+# Hermite cubics between two instants, and Lagrange polynomials through several.
+
+MEDIAN_NORM = 1.538  # median length of a vector with three standard normal components
+
+
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(..., 3) cross products of a and b (..., 3), which are broadcast. For a few hundred vectors it is several times
+    faster than numpy.cross."""
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        np.multiply(a[..., j], b[..., k], out=out[..., i])
+        out[..., i] -= a[..., k] * b[..., j]
+    return out
+
+
+def is_near(a: np.ndarray, b: np.ndarray, share: float) -> bool:
+    """Whether the norm of a - b is smaller than `share` times the norm of b."""
+    return float(np.linalg.norm(a - b)) < share * float(np.linalg.norm(b))
+
+
+def hermite(s: np.ndarray, end: np.ndarray, before: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """Cubic in s from 0 at s = 0 to `end` at s = 1. before, behind: its derivatives by s at s = 0 and s = 1."""
+    return s * (before + s * (3.0 * end - 2.0 * before - behind + s * (before + behind - 2.0 * end)))
+
+
+def lagrange_weights(t: np.ndarray) -> np.ndarray:
+    """(k, n) weights of k values at times t (k, n), with which the interpolating polynomial is evaluated at time 0."""
+    weight = np.ones_like(t)
+    for a in range(len(t)):
+        for b in range(len(t)):
+            if a != b:
+                weight[a] *= t[b] / (t[b] - t[a])
+    return weight
+
+
+# Time integrals of signals that are linear between their stamps, and means of band-limited signals.
+
+# Gauss-Legendre quadrature over -1/2 to 1/2, exact up to degree 5.
+_GAUSS_NODES = np.array([-0.5, 0.0, 0.5]) * np.sqrt(0.6)
+_GAUSS_WEIGHTS = np.array([5.0, 8.0, 5.0]) / 18.0
+
+
+def once_integrated(x: np.ndarray, dt: np.ndarray) -> np.ndarray:
+    """(N, ...) integral of x (N, ...) from the first stamp to each, by the trapezoidal rule. dt (N - 1,): steps [s]."""
+    out = np.zeros_like(x)
+    out[1:] = np.cumsum(0.5 * (x[1:] + x[:-1]) * _along_first(dt, x), axis=0)
+    return out
+
+
+def twice_integrated(x: np.ndarray, once: np.ndarray, dt: np.ndarray) -> np.ndarray:
+    """(N, ...) double integral of x (N, ...) from the first stamp to each, exact for a signal that is linear between
+    stamps. once (N, ...): its first integral; dt (N - 1,): steps [s]."""
+    step = _along_first(dt, x)
+    out = np.zeros_like(x)
+    out[1:] = np.cumsum(once[:-1] * step + (2.0 * x[:-1] + x[1:]) * step**2 / 6.0, axis=0)
+    return out
+
+
+def _along_first(dt: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """dt (n,), reshaped so that it multiplies x along its first axis."""
+    return dt.reshape(-1, *(1,) * (x.ndim - 1))
+
+
+@njit(cache=True, nogil=True)
+def polynomial_means(t, x, spans, first, last, count, out):
+    """Fills out (Q, m) with means of polynomials through samples x (N, m) at times t (N,).
+
+    spans (Q, 2): begin and end of each mean, which may coincide. The polynomial passes through the `count` samples
+    around the span, of those from number first to last (Q,); through fewer if there are no more.
+    """
+    for q in range(len(spans)):
+        n = min(count, last[q] - first[q] + 1)
+        middle = 0.5 * (spans[q, 0] + spans[q, 1])
+        begin = np.searchsorted(t, middle, side="right") - n // 2
+        begin = min(max(begin, first[q]), last[q] - n + 1)
+        for c in range(x.shape[1]):
+            out[q, c] = 0.0
+        for g in range(3):
+            at = middle + _GAUSS_NODES[g] * (spans[q, 1] - spans[q, 0])
+            for i in range(n):
+                weight = _GAUSS_WEIGHTS[g]
+                for k in range(n):
+                    if k != i:
+                        weight *= (at - t[begin + k]) / (t[begin + i] - t[begin + k])
+                for c in range(x.shape[1]):
+                    out[q, c] += weight * x[begin + i, c]

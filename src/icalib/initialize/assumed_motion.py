@@ -18,38 +18,32 @@ from typing import Any
 
 import numpy as np
 
-from icalib.data.measurements import Measurements
+from icalib.data.measurements import ImuStream, Measurements, PoseStream
 from icalib.errors import EstimationError
-from icalib.estimate.problem.assembly import keyframe_times, keyframes_for, start_values
-from icalib.estimate.problem.inputs import Inputs, inputs_for
+from icalib.estimate.inputs import Inputs, inputs_for
+from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry.targets.base import BOARD
-from icalib.initialize.assumed_sensors import ASSUMED_IMU, assumed_imu, pose_streams, with_assumed_readings
-from icalib.initialize.hosts_on_odometry import (
-    body_poses_by,
-    hosts_without_body,
-    relative_to_body,
-    with_pose_sensor,
-    with_stated_values,
-)
-from icalib.initialize.steps.contradicted_guesses import MotionContradictedError, stated_values
-from icalib.initialize.steps.initializer import (
+from icalib.initialize.initializer import (
     InitialGuess,
     Initializer,
+    MotionContradictedError,
     SmoothMotion,
     Values,
     initializer_of,
     keyframe_hosts,
     kinds_of,
+    merged_values,
     motion_kinds,
     place_sensors,
+    stated_values,
 )
-from icalib.initialize.steps.smooth_trajectory import MIN_PARABOLA_POSES, BodyPoses, SmoothTrajectory
-from icalib.model.frames import FRAME, frame_of
-from icalib.motion.keyframe_placement import first_keyframes
+from icalib.initialize.smooth_trajectory import MIN_PARABOLA_POSES, BodyPoses, SmoothTrajectory
+from icalib.model.sensor_model import FRAME, frame_of
+from icalib.motion.poses import first_keyframes
 from icalib.optim.state import State, in_recording
-from icalib.rig import Rig
+from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseSensor, Rig, Sensor
 from icalib.sensors.parameter import fixed
-from icalib.sensors.sensor import mounted
+from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 from icalib.sensors.stream import Stream
 
 SLOW_HZ = 10.0  # rate of poses below which motion by hand may change direction between two of them
@@ -258,4 +252,124 @@ def _body_identities(inputs: Inputs) -> Values:
             (frame, FRAME[1]): np.zeros(3),
         }
         out |= {key: value for key, value in world.items() if key in keys}
+    return out
+
+
+# Sensors that stand for an assumption: an IMU for smooth motion, and a pose sensor for dead reckoning.
+
+# Names of the assumed IMU, and of the pose sensor that stands for motion without the IMU. No sensor has a space in it.
+ASSUMED_IMU, ASSUMED_POSES = "assumed motion", "assumed poses"
+# s: ratio of the assumed IMU's white noise density to its random walk density; keeps covariances regular
+REGULARISING_STEP_S = 5e-3
+
+
+def assumed_imu(turning: float, jerking: float) -> ImuSensor:
+    """The IMU that stands for smooth motion. turning, jerking: densities of the motion's angular acceleration
+    [rad/s^2/sqrt(Hz)] and jerk [m/s^3/sqrt(Hz)]."""
+    noise = ImuNoise(REGULARISING_STEP_S * turning, turning, REGULARISING_STEP_S * jerking, jerking, ASSUMED_IMU)
+    return ImuSensor(ASSUMED_IMU, "", noise, Parameter("fixed"), assumed=True)
+
+
+def with_assumed_readings(
+    recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory], max_gap_s: float | None = None
+) -> list[Measurements]:
+    """The recordings with readings of the assumed IMU. With `max_gap_s`: zeros, except in gaps between poses that are
+    longer [s]. Without: ideal readings at the instants with poses nearby."""
+    out = []
+    for m, path in zip(recordings, paths, strict=True):
+        stamps = m.origin_ns + np.round(path.seconds * 1e9).astype(np.int64)
+        used = path.near.copy() if max_gap_s is None else _within_short_gaps(path, max_gap_s)
+        used[:1] = True  # its clock begins where the body's does
+        gyro, accel = (x[used] * float(max_gap_s is None) for x in (path.rate, path.acceleration))
+        out.append(m.with_streams(ImuStream(ASSUMED_IMU, stamps[used], gyro, accel)))
+    return out
+
+
+def _within_short_gaps(path: SmoothTrajectory, max_gap_s: float) -> np.ndarray:
+    """(m,) whether poses are nearby, or the gap between poses is at most `max_gap_s`. Over longer gaps the assumption
+    does not constrain the motion."""
+    pose_s = path.seconds[path.near]
+    if not len(pose_s):
+        return np.zeros(len(path.seconds), dtype=bool)
+    after, ends = np.searchsorted(pose_s, path.seconds), np.concatenate([[-np.inf], pose_s, [np.inf]])
+    previous_s, next_s = ends[after], ends[after + 1]
+    return path.near | (next_s - previous_s <= max_gap_s)
+
+
+def pose_sensor_for(odometry: str) -> PoseSensor:
+    """The pose sensor that stands for the sensor `odometry`."""
+    return PoseSensor(odometry, "", "absolute")
+
+
+def pose_streams(recordings: Sequence[Measurements], odometry: str, paths: Sequence[BodyPoses]) -> list[PoseStream]:
+    """The trajectories `paths` of `odometry`, one for each recording, as measurements of a pose sensor."""
+    stamps = [m.streams[odometry].stamps_ns for m in recordings]
+    return [PoseStream(odometry, t, p.rotation, p.position) for t, p in zip(stamps, paths, strict=True)]
+
+
+# Aligns sensors that host keyframes to a trajectory by odometry, which takes the place of a pose sensor.
+#
+# The body is the first of these sensors. Poses and extrinsics relative to the odometry are converted to the body.
+
+
+def hosts_without_body(rig: Rig) -> list[Sensor]:
+    """The sensors at whose measurements keyframes are set, without the body."""
+    return [s for s in keyframe_hosts(rig.mounted) if s.name != rig.reference_without_imu]
+
+
+def with_pose_sensor(rig: Rig, sensor: str) -> Rig:
+    """A rig of the sensors of `rig` that host keyframes, and a pose sensor named `sensor` in place of the odometry.
+    Extrinsics of the hosts are unknown."""
+    free = dict.fromkeys(MOUNTED_NAMES, Parameter())
+    hosts = (replace(s, clock_restarts=False, **free) for s in keyframe_hosts(rig.mounted))
+    return rig.only().with_sensors(*hosts, pose_sensor_for(sensor))
+
+
+def body_poses_by(
+    rig: Rig, recordings: Sequence[Measurements], sensor: str, paths: Sequence[BodyPoses], values: Values
+) -> list[BodyPoses]:
+    """Poses of the body, on its clock, from trajectories `paths` of `sensor`. values: extrinsics and time offset of the
+    body relative to `sensor`."""
+    R, p, offset = (values[rig.reference, name] for name in MOUNTED_NAMES)
+    between = [(m.origin_ns - m.streams[sensor].origin_ns) * 1e-9 for m in recordings]
+    return [
+        BodyPoses(path.seconds - offset[0] + between[0] - b, path.rotation @ R, path.position + path.rotation @ p)
+        for path, b in zip(paths, between, strict=True)
+    ]
+
+
+def relative_to_body(rig: Rig, sensor: str, values: Values) -> Values:
+    """Extrinsics and time offsets of `sensor` and of the other hosts relative to the body. `values` has those of the
+    hosts relative to `sensor`. Also returns their other `values`, and the other parameters of `sensor` as the rig file
+    gives them."""
+    others = [s.name for s in hosts_without_body(rig)]
+    R, p, offset = (values[rig.reference, name] for name in MOUNTED_NAMES)
+    out = {key: value for key, value in values.items() if key[1] not in MOUNTED_NAMES}
+    mounts = {sensor: (np.eye(3), np.zeros(3), np.zeros(1))}
+    mounts |= {host: tuple(values[host, name] for name in MOUNTED_NAMES) for host in others}
+    for name, (Q, q, dt) in mounts.items():
+        out |= {(name, "rotation"): R.T @ Q, (name, "translation"): R.T @ (q - p), (name, "time_offset"): dt - offset}
+    for spec in rig.sensors[sensor].specs():
+        if spec.name not in MOUNTED_NAMES:
+            value = getattr(rig.sensors[sensor], spec.name).value
+            usual = np.full(spec.size, float(spec.is_positive))
+            out[sensor, spec.name] = usual if value is None else np.asarray(value)
+    return out
+
+
+def with_stated_values(inputs: Inputs, sensor: str, estimates: Values) -> Values:
+    """`estimates`, completed by values of the rig file for the hosts and `sensor` that do not contradict it. The height
+    of `sensor` is taken from the rig file if stated, because planar motion does not show it."""
+    out, rig = dict(estimates), inputs.rig
+    for rig_sensor in (*hosts_without_body(rig), rig.sensors[sensor]):
+        names = MOUNTED_NAMES if rig_sensor.name != sensor else [spec.name for spec in rig_sensor.specs()]
+        stated, of_sensor = (
+            stated_values(inputs, rig_sensor, names),
+            {k: v for k, v in estimates.items() if k[0] == rig_sensor.name},
+        )
+        arm = sensor, "translation"
+        if arm in stated and arm in of_sensor:
+            up = of_sensor[sensor, "rotation"][:, 2]
+            of_sensor[arm] = of_sensor[arm] + up * (up @ (stated[arm] - of_sensor[arm]))
+        out |= merged_values(rig_sensor, stated, of_sensor)
     return out

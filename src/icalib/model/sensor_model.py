@@ -5,22 +5,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
-from typing import Any, ClassVar, Generic, TypeVar
+from functools import cache, cached_property
+from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
-from icalib.data.joining import Part
-from icalib.data.measurements import Measurements
+from icalib.data.measurements import Measurements, Part
 from icalib.model.bodies import Bodies
-from icalib.model.statistics import PassEnd, ResidualStatistics
-from icalib.motion.factor import Factor, FactorKey
+from icalib.motion.factor import Factor, FactorKey, FitKey, Residuals, Squares
 from icalib.motion.imu_data import ImuData
-from icalib.motion.plane_association import PlaneAssociation
-from icalib.motion.sweep import EstimatedMotion
-from icalib.motion.time_offsets import instants
-from icalib.optim.state import Entry, Key, Layout, State
-from icalib.rig import ParameterSpec, Rig, Sensor, Settings
+from icalib.motion.point_planes import PlaneAssociation
+from icalib.motion.poses import EstimatedMotion, instants
+from icalib.optim.state import Entry, Key, Layout, State, in_recording
+from icalib.rig import ParameterSpec, Rig, Sensor, Settings, scene
 from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.sensor import TIME_OFFSET
 
@@ -249,3 +246,112 @@ def own_entries(
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:
     """Number of time offsets of a sensor: one, or one per recording if its clock restarts."""
     return n_recordings if sensor.clock_restarts else 1
+
+
+# Residual statistics of a pass, from which the noise of each sensor is estimated.
+
+LEAST_DOF_SHARE = 0.2  # degrees of freedom over residuals: below it, the motion absorbs too much noise for an estimate
+# Subtracted from the degrees of freedom of sensors at rest, which may be few. This gives the posterior mean of the
+# variance under Jeffreys' prior; standard deviations are then those of Student's t distribution.
+FEW_DOF = 2.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """chi^2 of one kind of residual, number of residuals, and degrees of freedom left after the fit.
+
+    kind: "gyroscope", "accelerometer", "bias walk", "corners", "features", "points on planes", or "common error" and
+    "stamp jitter" for the errors that all corners of an image share.
+    """
+
+    sensor: str
+    kind: str
+    count: int
+    dof: float
+    chi2: float
+
+
+@dataclass(frozen=True)
+class ResidualStatistics:
+    """Residual statistics of one sensor, by kind of residual. at_rest: True without an IMU, when keyframes are
+    independent. all_squares, all_fits: statistics of all sensors, computed on demand, because degrees of freedom need
+    posterior draws."""
+
+    sensor: str
+    at_rest: bool
+    all_squares: Callable[[], dict[FitKey, Squares]]
+    all_fits: Callable[[], list[Fit]]
+
+    @cached_property
+    def squares(self) -> dict[str, Squares]:
+        """Number and chi^2 by kind, with the current robust weights."""
+        return {kind: squares for (sensor, kind), squares in self.all_squares().items() if sensor == self.sensor}
+
+    @cached_property
+    def fits(self) -> dict[str, Fit]:
+        """Number, chi^2 and degrees of freedom after the fit, by kind."""
+        return {f.kind: f for f in self.all_fits() if f.sensor == self.sensor}
+
+    def variance_factors(self) -> dict[str, float]:
+        """chi^2 over degrees of freedom by kind: 1 if the noise is as assumed. Kinds with too few degrees of freedom
+        are left out. At rest, FEW_DOF degrees of freedom are subtracted (see there)."""
+        known = {kind: f for kind, f in self.fits.items() if f.dof > LEAST_DOF_SHARE * f.count}
+        return {k: f.chi2 / (max(f.dof - FEW_DOF, 1.0) if self.at_rest else f.dof) for k, f in known.items()}
+
+
+@dataclass(frozen=True)
+class PassEnd:
+    """End of a pass: its factors, and their residuals at `state`.
+
+    is_first: whether it was the first pass. at_rest, all_squares, all_fits: see `ResidualStatistics`.
+    """
+
+    rig: Rig
+    state: State
+    factors: Mapping[FactorKey, Factor]
+    residuals: Residuals
+    is_first: bool
+    at_rest: bool
+    all_squares: Callable[[], dict[FitKey, Squares]]
+    all_fits: Callable[[], list[Fit]]
+
+    def of(self, sensor: str) -> ResidualStatistics:
+        """Residual statistics of one sensor."""
+        return ResidualStatistics(sensor, self.at_rest, self.all_squares, self.all_fits)
+
+
+# Reference frames of sensors that report poses or positions. They are fixed in the world of each recording.
+
+FRAME = tuple(spec.name for spec in scene.FRAME)  # R_world_frame, p_world_frame
+
+
+def frame_of(sensor: str, recording: int) -> str:
+    """Name of a sensor's reference frame in a `recording` (counted from 0): the first part of the keys of the blocks
+    `FRAME`."""
+    return in_recording(f"frame of {sensor}", recording)
+
+
+def frame_entries(
+    sensor: str, n_recordings: int, estimated: bool = True, specs: Sequence[ParameterSpec] = scene.FRAME
+) -> list[Entry]:
+    """Layout entries of a sensor's reference frame in each recording. estimated: False if the frame is the world
+    frame."""
+    return [spec.entry(frame_of(sensor, k), estimated) for k in range(n_recordings) for spec in specs]
+
+
+# Interface of factors with points on the target, for any sensor.
+
+
+@runtime_checkable
+class TargetFactor(Factor, Protocol):
+    """A factor with points on `bodies` of the target. sees_target: whether it has any such point."""
+
+    @property
+    def bodies(self) -> Bodies: ...
+
+    @property
+    def sees_target(self) -> bool: ...
+
+    def with_target_size(self, size: float) -> Self:
+        """The same measurements, for a target with `size` times the stated lengths."""
+        ...

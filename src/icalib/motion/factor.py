@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 
+from icalib.base.compiled import njit
+from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
-from icalib.optim.state import State
+from icalib.optim.rows import LOSSES, Loss, Rows, accumulate_rows
+from icalib.optim.state import KEYFRAME_DIM, POSE_DIM, State
 
 FactorKey = tuple[str, str]  # sensor, and kind of measurement
 FitKey = tuple[str, str]  # sensor, and kind of its residuals
@@ -312,3 +315,222 @@ def of_type(by_key: Mapping[FactorKey, Any], wanted: type[T]) -> tuple[T, ...]:
 def pairs_of(factors: Mapping[FactorKey, Factor], outputs: Residuals, wanted: type[T]) -> list[tuple[T, Any]]:
     """Factors of the class `wanted`, each with its output."""
     return [(f, outputs[key]) for key, f in factors.items() if isinstance(f, wanted)]
+
+
+# Replacement of the IMU factor in a rig without IMU: keyframes at image instants, with no term between them.
+
+# information [1/rad^2, 1/m^2]: keeps a keyframe without measurements positive definite; too weak for other effects
+WEAK_POSE_INFORMATION = 1e-9
+
+
+@dataclass(frozen=True)
+class IndependentKeyframes(RowFactor):
+    """Chain factor without measurements: a little information keeps each keyframe positive definite. Velocity and
+    biases, on which no measurement depends, are fixed."""
+
+    name: str  # of the sensor that is the body frame
+    n_keyframes: int
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, "keyframes"
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        """Empty: the factor has no residuals."""
+        return {}
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """(0,): one chain for all recordings, because no term links neighbours."""
+        return (0,)
+
+    @property
+    def imu(self) -> None:
+        """None: no readings link keyframes."""
+        return None
+
+    def with_imu(self, imu: ImuData, state: State) -> IndependentKeyframes:
+        """The same factor, as there is no IMU."""
+        del imu, state
+        return self
+
+    def output(self) -> Whitened:
+        """Empty rows (K - 1, 15)."""
+        return Whitened.without_loss(self.n_keyframes - 1, KEYFRAME_DIM)
+
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """Adds information that keeps the keyframes of `piece` positive definite. Returns 0, its cost."""
+        del state, out, curved
+        if sums:
+            information = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
+            piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += information
+        return 0.0
+
+    def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
+        """Returns 0, as there are no biases."""
+        del state, piece, sums
+        return 0.0
+
+
+# Adds measurement rows between neighbouring keyframes to the normal equations.
+
+# Rows whose Jacobians are computed at once: these fit the processor's cache.
+ROWS_PER_CHUNK = 256
+
+
+class Into(NamedTuple):
+    """Target of `add_rows`: the arguments of `Factor.accumulate`."""
+
+    piece: Piece
+    out: Whitened
+    sums: bool
+    curved: bool
+
+
+class RobustNoise(NamedTuple):
+    """Noise of n measurements of m rows. whitening (n, m, m): lower triangular; name and scale of the robust loss of
+    each whitened row."""
+
+    whitening: np.ndarray
+    loss: str
+    loss_scale: float
+
+
+def in_chunks(rows: slice) -> Iterator[slice]:
+    """Slices of at most ROWS_PER_CHUNK rows that make up `rows`."""
+    for start in range(rows.start, rows.stop, ROWS_PER_CHUNK):
+        yield slice(start, min(start + ROWS_PER_CHUNK, rows.stop))
+
+
+def rows_by_recording(
+    keyframe: np.ndarray, starts: tuple[int, ...], n_keyframes: int, piece: Piece
+) -> Iterator[tuple[int, slice]]:
+    """Rows in `piece`, at most ROWS_PER_CHUNK at a time, each slice with the number of its recording.
+
+    keyframe (n,), sorted: of each measurement; starts: first keyframe of each recording. Rows belong to intervals, so
+    those at the last keyframe, n_keyframes - 1, go to the last interval.
+    """
+    edges = np.searchsorted(keyframe, (*starts, n_keyframes))
+    low, high = np.searchsorted(np.minimum(keyframe, n_keyframes - 2), [piece.first, piece.last])
+    for k in range(len(starts)):
+        for some in in_chunks(slice(max(int(edges[k]), int(low)), min(int(edges[k + 1]), int(high)))):
+            yield k, some
+
+
+def add_rows(
+    rows: Rows, chunk: slice, keyframe: np.ndarray, columns: np.ndarray, noise: RobustNoise, into: Into
+) -> float:
+    """Adds the rows `chunk` of a factor, each to the interval that begins at its `keyframe` (n,), and fills `into.out`.
+    Returns half the robust chi^2. columns (c,): calibration columns of rows.J, -1 where fixed."""
+    loss = Loss(LOSSES[noise.loss], noise.loss_scale, into.curved)
+    return accumulate_rows(
+        rows, keyframe, noise.whitening, loss, columns, into.piece.sums(into.sums), into.out.residual[chunk],
+        into.out.root[chunk],
+    )  # fmt: skip
+
+
+# Residuals of poses that a sensor reports, with Jacobians by the pose of the sensor (`sensor_pose`) and by the
+# reference frame.
+#
+# Rotation: e = Log(measured^T predicted). Position: predicted - measured, in the axes of the measurement. Rotations
+# are perturbed on the right, so de = J_r^-1(e) d for a factor on the right of the prediction.
+
+
+@dataclass(frozen=True)
+class Extrinsics:
+    """R_imu_sensor (3, 3), p_imu_sensor (3,) m; or the pose of a sensor in the frame of another one."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Pose of a reference frame: R_world_frame (3, 3), p_world_frame (3,) m."""
+
+    R: np.ndarray
+    p: np.ndarray
+
+
+@dataclass(frozen=True)
+class PoseResiduals:
+    """n poses of 6 rows, rotation and position, not whitened. residual (n, 6); J_pose: (n, 6, 6) by the sensor's pose,
+    for relative poses one for each end; J_frame (n, 6, 6 or 0): by R_world_frame, p_world_frame. Jacobians have length
+    0 if not wanted."""
+
+    residual: np.ndarray
+    J_pose: tuple[np.ndarray, ...]
+    J_frame: np.ndarray
+
+    @classmethod
+    def alone(cls, residual: np.ndarray) -> PoseResiduals:
+        """Residuals (n, 6) without Jacobians."""
+        nothing = np.zeros((0, 6, 6))
+        return cls(residual, (nothing, nothing), nothing)
+
+
+def absolute_residuals(
+    R: np.ndarray, p: np.ndarray, frame: Frame, rotation: np.ndarray, position: np.ndarray, jacobians: bool = True
+) -> PoseResiduals:
+    """Residuals of measured poses R_frame_sensor `rotation` (n, 3, 3), p_frame_sensor `position` (n, 3). R (n, 3, 3), p
+    (n, 3): predicted poses of the sensor in the world.
+
+        Log(rotation^T R_world_frame^T R),  R_world_frame^T (p - p_world_frame) - position
+    """
+    n, predicted = len(R), frame.R.T @ R
+    e = so3.log_many(np.ascontiguousarray(_t(rotation) @ predicted))
+    x = (p - frame.p) @ frame.R
+    residual = np.concatenate([e, x - position], axis=1)
+    if not jacobians:
+        return PoseResiduals.alone(residual)
+    J = right_jacobians_inverse(e)
+    J_pose, J_frame = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    J_pose[:, :3, :3] = J
+    J_pose[:, 3:, 3:] = predicted
+    J_frame[:, :3, :3] = -J @ _t(predicted)
+    J_frame[:, 3:, :3] = so3.hat_many(x)
+    J_frame[:, 3:, 3:] = -frame.R.T
+    return PoseResiduals(residual, (J_pose,), J_frame)
+
+
+def relative_residuals(
+    R: tuple[np.ndarray, np.ndarray],
+    p: tuple[np.ndarray, np.ndarray],
+    rotation: np.ndarray,
+    position: np.ndarray,
+    jacobians: bool = True,
+) -> PoseResiduals:
+    """Residuals of measured poses `rotation` (n, 3, 3), `position` (n, 3) of the sensor at the later instant relative
+    to the earlier. R[0], p[0] and R[1], p[1]: predicted poses at both.
+
+        Log(rotation^T Q), Q = R_0^T R_1,  R_0^T (p_1 - p_0) - position
+    """
+    n, Q = len(R[0]), _t(R[0]) @ R[1]
+    e = so3.log_many(np.ascontiguousarray(_t(rotation) @ Q))
+    x = np.einsum("nji,nj->ni", R[0], p[1] - p[0])
+    residual = np.concatenate([e, x - position], axis=1)
+    if not jacobians:
+        return PoseResiduals.alone(residual)
+    J = right_jacobians_inverse(e)
+    before, after = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    before[:, :3, :3] = -J @ _t(Q)
+    before[:, 3:, :3] = so3.hat_many(x)
+    before[:, 3:, 3:] = -np.eye(3)
+    after[:, :3, :3] = J
+    after[:, 3:, 3:] = Q
+    return PoseResiduals(residual, (before, after), np.zeros((n, 6, 0)))
+
+
+@njit(cache=True, nogil=True)
+def right_jacobians_inverse(e: np.ndarray) -> np.ndarray:
+    """Inverse right Jacobians (n, 3, 3) at rotation vectors e (n, 3) rad."""
+    out = np.empty((len(e), 3, 3))
+    for i in range(len(e)):
+        out[i] = so3.right_jacobian_inverse(e[i])
+    return out
+
+
+def _t(R: np.ndarray) -> np.ndarray:
+    """Transposed matrices (..., 3, 3)."""
+    return np.swapaxes(R, -1, -2)

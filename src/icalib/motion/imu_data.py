@@ -8,10 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
-from icalib.data.joining import Part
-from icalib.data.measurements import ImuStream, Measurements
-from icalib.data.stamps.clocks import usual_step
-from icalib.geometry.integrals import polynomial_means
+from icalib.base.compiled import njit
+from icalib.data.measurements import ImuStream, Measurements, Part
+from icalib.data.stamps import usual_step
+from icalib.geometry import so3
+from icalib.geometry.small import mul3, polynomial_means, tmul3
 from icalib.geometry.targets.base import BOARD
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import ImuNoise, Rig, scene
@@ -236,3 +237,141 @@ def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> Im
     first = imus[0][1]
     model = first.walk, gaps, seams, first.forwards, first.unit, first.sampling
     return ImuData(joined.imu.name, seconds, gyro, accel, variance, *model)
+
+
+# Scale-misalignment model of IMU readings, in the axes of the gyroscope.
+#
+#     gyro  = M_g w + A_g f + b_g + noise      w: angular rate, f: specific force, both in the IMU frame
+#     accel = M_a C f + b_a + noise            M: lower triangular, C = Exp(r): gyroscope to accelerometer axes
+#
+# The IMU frame has its origin at the accelerometer and the axes of the gyroscope. Its x axis is the one that the
+# gyroscope's x axis measures, because M_g is lower triangular. Kalibr's frame has the axes of the accelerometer
+# instead, rotated by C.
+#
+# Intrinsics are 24 numbers (`INTRINSICS_LABELS` of `sensors.imu.spec`), zero for an ideal IMU: M_a - I (xx yx yy zx zy
+# zz), M_g - I (same), r (3), A_g (row-major 9).
+
+_LOWER_ROW = np.array([0, 1, 1, 2, 2, 2])
+_LOWER_COLUMN = np.array([0, 0, 1, 0, 1, 2])
+
+
+@njit(cache=True, nogil=True)
+def _lower_inverse(m):
+    """Inverse (3, 3) of a lower triangular matrix (3, 3)."""
+    inv = np.zeros((3, 3))
+    for i in range(3):
+        inv[i, i] = 1.0 / m[i, i]
+    inv[1, 0] = -m[1, 0] * inv[0, 0] * inv[1, 1]
+    inv[2, 1] = -m[2, 1] * inv[1, 1] * inv[2, 2]
+    inv[2, 0] = -(m[2, 0] * inv[0, 0] + m[2, 1] * inv[1, 0]) * inv[2, 2]
+    return inv
+
+
+@njit(cache=True, nogil=True)
+def correction_matrices(intrinsics):
+    """Matrices F, G, H that invert the model: f = F (accel - b_a), w = G (gyro - b_g) + H (accel - b_a); and G A_g."""
+    ma, mg = np.eye(3), np.eye(3)
+    for n in range(6):
+        ma[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[n]
+        mg[_LOWER_ROW[n], _LOWER_COLUMN[n]] += intrinsics[6 + n]
+    F, G = tmul3(so3.exp(intrinsics[12:15]), _lower_inverse(ma)), _lower_inverse(mg)
+    GA = mul3(G, intrinsics[15:24].reshape((3, 3)))
+    return F, G, -mul3(GA, F), GA
+
+
+# Sentences for messages: axes about which a body rotated, and about which it hardly did.
+
+# RMS rate about an axis over that about the strongest one: below it, rotation about the axis is too weak
+WEAK_AXIS_RATIO = 0.1
+NAMED_AXIS_COSINE = 0.9  # component of a unit vector: above it, the direction is called by the axis' name
+MIN_KEYFRAMES_FOR_AXES = 2  # keyframes with a rotation between them
+
+
+def hardly_turned(seconds: np.ndarray, rotation: np.ndarray, body: str) -> str:
+    """Words for the axes about which `body` hardly rotated, such as "the y and z axes of imu0"; empty if it rotated
+    about all three.
+
+    seconds (K,), rotation (K, 3, 3) R_world_body: its keyframes. Backward steps in time, between recordings, are
+    ignored.
+    """
+    if len(seconds) < MIN_KEYFRAMES_FOR_AXES:
+        return ""
+    step = np.diff(seconds)
+    turn = so3.log_many(np.ascontiguousarray(np.swapaxes(rotation[:-1], 1, 2) @ rotation[1:]))
+    rate = turn[step > 0.0] / np.sqrt(step[step > 0.0])[:, None]
+    squares, axes = np.linalg.eigh(rate.T @ rate)
+    weak = np.sqrt(np.maximum(squares, 0.0)) < WEAK_AXIS_RATIO * np.sqrt(max(squares[-1], 0.0))
+    if not weak.any():
+        return ""
+    return axis_words(body, axes[:, 0]) if weak.sum() == 1 else other_axes(body, axes[:, -1])
+
+
+def axis_words(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
+    """Words for a unit vector (3,) in the axes of `body`: "the z axis of imu0" if it is close to an axis."""
+    k = int(np.argmax(np.abs(direction)))
+    if abs(direction[k]) > NAMED_AXIS_COSINE:
+        return f"the {'xyz'[k]} axis of {body}"
+    return f"the direction {_numbers(direction)} in the axes of {body}"
+
+
+def other_axes(body: str, direction: np.ndarray | tuple[float, float, float]) -> str:
+    """Words for the two axes perpendicular to a unit vector (3,) in the axes of `body`, such as "the x and y axes of
+    imu0"."""
+    k = int(np.argmax(np.abs(direction)))
+    if abs(direction[k]) > NAMED_AXIS_COSINE:
+        return f"the {' and '.join(c for c in 'xyz' if c != 'xyz'[k])} axes of {body}"
+    return f"two axes perpendicular to the direction {_numbers(direction)} in the axes of {body}"
+
+
+def _numbers(direction: np.ndarray | tuple[float, float, float]) -> str:
+    return f"({', '.join(f'{x:.2f}' for x in direction)})"
+
+
+# Intervals between stamps over which a sensor that integrates (wheels, odometry) is compared with the motion.
+
+MAX_INTERVAL_S = 0.5  # the approximations within an interval hold up to this length
+
+
+@dataclass(frozen=True)
+class StampIntervals:
+    """n intervals between stamps `first` and `last` (n,), indices of a sensor's stamps. The first stamp belongs to
+    `keyframe` (n,), sorted, the last one to the next keyframe."""
+
+    first: np.ndarray
+    last: np.ndarray
+    keyframe: np.ndarray
+
+
+def choose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> StampIntervals:
+    """Intervals between the stamps nearest to neighbouring keyframes; `times` (N,): stamps on the IMU clock.
+
+    If keyframes are denser than stamps, neighbours may share a stamp. The interval to the next stamp then belongs to
+    the two keyframes about its middle. No interval leaves the IMU's recording, touches a gap in it, or crosses the
+    first keyframes `starts` of recordings. If motion is propagated forwards only (see `ImuData`), the stamp is the
+    first after the keyframe.
+    """
+    after = np.clip(np.searchsorted(times, keyframes), 1, len(times) - 1)
+    is_before = keyframes - times[after - 1] < times[after] - keyframes + SAME_INSTANT_S
+    near = after if imu.forwards else after - is_before
+    a, b = times[near[:-1]], times[near[1:]]
+    good = (a < b) & _usable(imu, a, b)
+    good[np.array(starts[1:], dtype=np.int64) - 1] = False
+    keyframe = np.flatnonzero(good)
+    return StampIntervals(near[keyframe], near[keyframe + 1], keyframe)
+
+
+def pose_intervals(imu: ImuData, keyframes: np.ndarray, starts: tuple[int, ...], times: np.ndarray) -> StampIntervals:
+    """All intervals between neighbouring stamps `times` (N,) on the IMU clock, each at the two keyframes about its
+    middle. None leaves the IMU's recording, touches a gap in it, or lies beyond the keyframes or between recordings."""
+    a, b = times[:-1], times[1:]
+    middle = 0.5 * (a + b)
+    good = _usable(imu, a, b) & (middle > keyframes[0]) & (middle < keyframes[-1])
+    keyframe = np.searchsorted(keyframes, middle) - 1
+    good &= ~np.isin(keyframe + 1, starts)
+    k = np.flatnonzero(good)
+    return StampIntervals(k, k + 1, keyframe[k])
+
+
+def _usable(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """(n,) whether each interval is short, and lies within one recording of the IMU and outside its gaps."""
+    return (end - start <= MAX_INTERVAL_S) & imu.covers(start, end) & clear_of(imu.seams, start, end)

@@ -15,7 +15,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
-from icalib.motion.imu_model import correction_matrices
+from icalib.motion.imu_data import correction_matrices
 
 _1_12, _1_48, _1_60, _1_99, _1_180, _1_360 = (1.0 / n for n in (12.0, 48.0, 60.0, 99.0, 180.0, 360.0))
 _1_1260, _1_10080, _3_112, _2_135, _2_165 = 1.0 / 1260.0, 1.0 / 10080.0, 3.0 / 112.0, 2.0 / 135.0, 2.0 / 165.0

@@ -9,15 +9,30 @@ A measurement stays assigned to its keyframe while the solver runs; only its tim
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from icalib.base.compiled import njit
+from icalib.data.measurements import Stream
 from icalib.geometry import so3
-from icalib.motion.imu_data import SAME_INSTANT_S, ImuData
-from icalib.motion.integration import bias_of, corrected, place_in_interval, readings_of
+from icalib.geometry.small import mul3
+from icalib.motion.imu_data import SAME_INSTANT_S, ImuData, clear_of
+from icalib.motion.integration import (
+    ImuMotion,
+    bias_of,
+    corrected,
+    empty_prefix,
+    integrate_from_keyframe,
+    keyframes_of,
+    place,
+    place_in_interval,
+    propagation_query,
+    readings_of,
+    rotation_of,
+)
 from icalib.motion.integration_step import (
     AT_INTRINSICS,
     AT_J,
@@ -30,17 +45,9 @@ from icalib.motion.integration_step import (
     correction,
     fill_intrinsics,
 )
-from icalib.motion.propagation import (
-    ImuMotion,
-    empty_prefix,
-    integrate_from_keyframe,
-    keyframes_of,
-    place,
-    propagation_query,
-    rotation_of,
-)
-from icalib.optim.state import KEYFRAME_DIM, State
+from icalib.optim.state import KEYFRAME_DIM, Key, Layout, State
 from icalib.rig import Scheme
+from icalib.rig.scene import GRAVITY, WORLD
 
 
 @dataclass(frozen=True)
@@ -310,3 +317,209 @@ def _propagated(
     intrinsics = state.values[imu.name, "intrinsics"]
     _inertial(query, keyframes, readings_of(imu), intrinsics, at, out.J_keyframe, out.J_imu, derivatives)
     return out
+
+
+# Motion of the IMU between the keyframes of a state: nearest keyframes of measurements, poses and twists of a LiDAR.
+
+
+def gravity_of(state: State, stated: float) -> float:
+    """Magnitude of gravity [m/s^2] at `state`; `stated` where a state of the first guess has none."""
+    return float(state.values.get((WORLD, GRAVITY.name), [stated])[0])
+
+
+@dataclass(frozen=True)
+class EstimatedMotion:
+    """Motion of the IMU between the keyframes of `state`.
+
+    gravity [m/s^2]: a constant within a pass, unlike that of the IMU factor. Sensors are 25 ms from a keyframe at most;
+    its standard deviation of 0.02 m/s^2 moves them by 6 um before the next pass. IMU gaps up to max_gap_s are
+    bridged.
+    """
+
+    state: State
+    imu: ImuData
+    gravity: float
+    max_gap_s: float
+
+    def near_keyframes(self, stream: Stream, within_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Measurements of `stream` within `within_s` of a keyframe and outside long gaps of the IMU: their indices
+        (n,), sorted by keyframe, and the keyframes (n,)."""
+        times = instants(stream, self.state.values)
+        keyframe = assign_keyframes("inertial", self.state.seconds, times, self.imu.forwards)
+        near = np.abs(times - self.state.seconds[keyframe]) <= within_s
+        indices = np.flatnonzero(near & usable(self.imu, times, self.max_gap_s))
+        indices = indices[np.argsort(keyframe[indices], kind="stable")]
+        return indices, keyframe[indices]
+
+
+class Sweep(NamedTuple):
+    """Poses and twists of a LiDAR at n instants: R_world_lidar (n, 3, 3), p_world_lidar (n, 3) [m], rate [rad/s] and
+    velocity [m/s] (n, 3) in LiDAR axes."""
+
+    rotation: np.ndarray
+    position: np.ndarray
+    rate: np.ndarray
+    velocity: np.ndarray
+
+
+@njit(cache=True, nogil=True)
+def _to_lidar(R_il, p_il, R, p, rate, velocity):
+    """Transforms poses, rates and velocities of the IMU to those of the LiDAR, in place. R_il, p_il: T_imu_lidar. Rates
+    and velocities end in LiDAR axes."""
+    for i in range(len(R)):
+        w0, w1, w2 = rate[i, 0], rate[i, 1], rate[i, 2]
+        lever = (w1 * p_il[2] - w2 * p_il[1], w2 * p_il[0] - w0 * p_il[2], w0 * p_il[1] - w1 * p_il[0])
+        velocity_i = np.empty(3)
+        for a in range(3):
+            velocity_i[a] = lever[a]
+            for c in range(3):
+                velocity_i[a] += R[i, c, a] * velocity[i, c]
+                p[i, a] += R[i, a, c] * p_il[c]
+        for a in range(3):
+            rate[i, a] = R_il[0, a] * w0 + R_il[1, a] * w1 + R_il[2, a] * w2
+            velocity[i, a] = R_il[0, a] * velocity_i[0] + R_il[1, a] * velocity_i[1] + R_il[2, a] * velocity_i[2]
+        rotation = mul3(R[i], R_il)
+        for a in range(3):
+            for c in range(3):
+                R[i, a, c] = rotation[a, c]
+
+
+def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray | None = None) -> Sweep:
+    """Poses and twists of LiDAR `name` at `times` (n,) on the IMU clock, integrated from the keyframes nearest to
+    these, or to `near` (n,)."""
+    state, imu = drive.state, drive.imu
+    keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
+    imu_at = poses_without_jacobians(times, keyframe, state, imu, drive.gravity)
+    R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
+    poses = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
+    _to_lidar(np.ascontiguousarray(R_il), p_il, *poses)
+    return poses
+
+
+# Motion of the IMU that is already estimated, for aligning further sensors to it.
+
+MAX_KEYFRAME_DISTANCE_S = 0.15  # covers a LiDAR scan of 10 Hz whose keyframe is at its start
+
+
+def are_near_keyframes(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) whether there is a keyframe within MAX_KEYFRAME_DISTANCE_S of each time (n,)."""
+    k = np.clip(np.searchsorted(keyframes, times), 1, len(keyframes) - 1)
+    return np.minimum(np.abs(times - keyframes[k - 1]), np.abs(times - keyframes[k])) < MAX_KEYFRAME_DISTANCE_S
+
+
+def is_known(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """(n,) whether the motion is known at each time (n,) on the IMU clock: between keyframes and near one of them."""
+    return are_near_keyframes(keyframes, times) & (times >= keyframes[0]) & (times <= keyframes[-1])
+
+
+def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
+    """Poses of the IMU at times (n,) on its clock, integrated from the nearest keyframes."""
+    keyframe = assign_keyframes("inertial", motion.state.seconds, times)
+    return poses_at("inertial", times, keyframe, motion.state, motion.imu, motion.gravity, False)
+
+
+# Time offsets of sensor clocks against the clock of the body: one, or one per recording if the clock restarts.
+#
+# The value of the block time_offset is (1,) or (R,): seconds to add to a sensor's time since its first stamp to get
+# the time of the body.
+
+RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; recordings are further apart
+
+
+def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
+    """Times (n,) on the clock of the body. seconds (n,): times since the first stamp of the stream, by default those of
+    its stamps."""
+    t, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
+    if len(offset) == 1:
+        return t + offset[0]
+    joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - RECORDING_MARGIN_S
+    assert len(joins) == len(offset) - 1
+    return t + offset[np.searchsorted(joins, t, side="right")]
+
+
+def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
+    """Number (n,) of the time offset that applies to measurements at `keyframe` (n,)."""
+    if len(state.values[name, "time_offset"]) == 1:
+        return np.zeros(len(keyframe), dtype=np.int64)
+    return np.searchsorted(state.starts, keyframe, side="right") - 1
+
+
+def offset_at(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
+    """Time offset (n,) s of a sensor's measurements at `keyframe` (n,)."""
+    return state.values[name, "time_offset"][clock_numbers(state, name, keyframe)]
+
+
+def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
+    """For each time offset, its number and the slice of measurements at `keyframe` (n,), sorted, that it applies to."""
+    if len(state.values[name, "time_offset"]) == 1:
+        yield 0, slice(0, len(keyframe))
+        return
+    edges = np.searchsorted(keyframe, (*state.starts, len(state.seconds)))
+    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        if a < b:
+            yield k, slice(int(a), int(b))
+
+
+def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
+    """Calibration columns (7,) of a sensor's rotation (-1 if it has none), translation, and time offset number `clock`
+    or the only one."""
+    offset = layout.columns(name, "time_offset")
+    offset_column = offset[clock if len(offset) > 1 else 0]
+    rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
+    return np.concatenate([rotation, layout.columns(name, "translation"), [offset_column]])
+
+
+# Placement of keyframes: at every distinct image instant, and evenly spaced between distant ones.
+
+MERGED_WITHIN_S = 2e-3  # images closer in time share a keyframe
+SPACING_SLACK = 0.1  # of the spacing: intervals longer by up to this get no keyframe, so that jitter adds none
+
+
+def place_keyframes(imu: ImuData, image_times: list[np.ndarray], spacing: float, max_gap: float) -> np.ndarray:
+    """Keyframe times (K,), seconds on the IMU clock: all image instants, none further apart than 1.1 `spacing` s.
+
+    IMU gaps up to `max_gap` seconds have keyframes too; longer ones, and intervals between recordings, have none.
+    """
+    times = np.sort(np.concatenate(image_times))
+    instants = distinct(times[usable(imu, times, max_gap)])
+    parts = [_filled(recorded, spacing) for recorded in np.split(instants, first_keyframes(imu, instants)[1:])]
+    keyframes = np.concatenate(parts)
+    return keyframes[clear_of(_long_gaps(imu, max_gap), keyframes, keyframes)]
+
+
+def _filled(times: np.ndarray, spacing: float) -> np.ndarray:
+    """Sorted `times` (n,) with evenly spaced instants inserted where they are further apart than 1.1 `spacing`."""
+    apart = np.diff(times)
+    steps = np.maximum(np.ceil(apart / spacing - SPACING_SLACK), 1.0).astype(np.int64)
+    last = np.cumsum(steps)
+    k = np.arange(1, steps.sum() + 1) - np.repeat(last - steps, steps)
+    filled = np.append(times[:1], np.repeat(times[:-1], steps) + k * np.repeat(apart / steps, steps))
+    filled[last] = times[1:]
+    return filled
+
+
+def first_keyframes(imu: ImuData | None, keyframes: np.ndarray) -> tuple[int, ...]:
+    """Index of the first keyframe of each recording, in `keyframes` (K,) s; (0,) without an IMU."""
+    seams = () if imu is None else imu.seams
+    return (0, *(int(k) for k in np.searchsorted(keyframes, [end for end, _ in seams], side="right")))
+
+
+def distinct(times: np.ndarray) -> np.ndarray:
+    """The first of each group of sorted `times` within MERGED_WITHIN_S of one another."""
+    return times[np.diff(times, prepend=-np.inf) > MERGED_WITHIN_S]
+
+
+def spaced(seconds: np.ndarray, spacing: float) -> np.ndarray:
+    """The first of `seconds` (n,), increasing, in each interval of length `spacing` [s]; and the last of all."""
+    k = np.flatnonzero(np.diff(np.floor(seconds / spacing + 1e-6), prepend=-1.0))
+    return seconds[np.append(k, len(seconds) - 1)] if k[-1] < len(seconds) - 1 else seconds[k]
+
+
+def usable(imu: ImuData, times: np.ndarray, max_gap: float) -> np.ndarray:
+    """(n,) whether the IMU has readings at each time; gaps up to `max_gap` seconds count as readings."""
+    inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
+    return inside & clear_of((*_long_gaps(imu, max_gap), *imu.seams), times, times)
+
+
+def _long_gaps(imu: ImuData, max_gap: float) -> list[tuple[float, float]]:
+    return [(a, b) for a, b in imu.gaps if b - a > max_gap]

@@ -21,8 +21,7 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import Poses, poses_at, poses_of_keyframes, poses_without_jacobians
-from icalib.motion.time_offsets import offset_at, pose_columns
+from icalib.motion.poses import Poses, offset_at, pose_columns, poses_at, poses_of_keyframes, poses_without_jacobians
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, UInt
 from icalib.optim.state import KEYFRAME_DIM, Layout, State
 from icalib.rig import Scheme

@@ -12,7 +12,7 @@ does not depend on the number of cores, and so neither does the result.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
@@ -21,14 +21,109 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from icalib.base.compiled import njit
 from icalib.errors import EstimationError
+from icalib.geometry import so3
 from icalib.geometry.small import cholesky
 from icalib.optim import memory
-from icalib.optim.calib_block import NO_DIRECTIONS, calib_draws, calib_step
-from icalib.optim.chain_kernels import damp, eliminate_chain, forward_solve, substitute_chain
-from icalib.optim.front import Eliminated, PieceFeatures, eliminate
-from icalib.optim.front_plan import plan
-from icalib.optim.state import KEYFRAME_DIM
+from icalib.optim.front import Eliminated, PieceFeatures, eliminate, plan
+from icalib.optim.state import KEYFRAME_DIM, Block, Layout, State
+
+# Reduced normal equations of the calibration parameters, all keyframes eliminated: steps, draws and inverses in units
+# of the tolerances. Unobservable directions are fixed.
+
+# Information in units of 1 / tolerance^2: a standard deviation of ten tolerances. Directions with less are fixed.
+UNOBSERVABLE_BELOW = 1e-2
+DETERMINED_ABOVE = 1.0  # in the same units: a standard deviation of one tolerance
+MIN_INFORMATION = 1e-4  # in the same units: floor that keeps variances finite
+NO_DIRECTIONS = np.zeros((0, 0))  # no direction is fixed
+
+
+def calib_step(
+    information: np.ndarray,
+    gradient: np.ndarray,
+    tolerance: np.ndarray,
+    fixed_directions: np.ndarray = NO_DIRECTIONS,
+    essential: np.ndarray | None = None,
+) -> tuple[np.ndarray, float]:
+    """Step (B,) of the calibration parameters and its predicted decrease of half the chi^2.
+
+    information (B, B), gradient (B,): of half the chi^2, chain marginalised. essential: columns of all but nuisance
+    parameters (default: all). Fixed are the orthonormal columns of `fixed_directions` (B, m), and eigenvectors below
+    UNOBSERVABLE_BELOW of the information of the essential parameters in units of `tolerance` (B,). Nuisance parameters
+    count as known there: their priors bound a direction that only they move.
+    """
+    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    projected = root.T @ (free.T @ (tolerance * gradient))
+    return -tolerance * (free @ (root @ projected)), float(0.5 * projected @ projected)
+
+
+def _free_root(
+    information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, essential: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Orthonormal directions (B, n) that are not fixed, and a root (n, k) of the inverse of the information within
+    them, in units of `tolerance`. Arguments as in `calib_step`."""
+    n = len(tolerance)
+    columns = np.arange(n) if essential is None else essential
+    others = np.setdiff1d(np.arange(n), columns)
+    scaled = information * tolerance[:, None] * tolerance
+    candidates = complement(fixed_directions[columns] if fixed_directions.size else NO_DIRECTIONS, len(columns))
+    values, vectors = np.linalg.eigh(candidates.T @ scaled[np.ix_(columns, columns)] @ candidates)
+    kept = vectors[:, values > UNOBSERVABLE_BELOW]
+    free = np.zeros((n, kept.shape[1] + len(others)))
+    free[columns, : kept.shape[1]] = candidates @ kept
+    free[others, kept.shape[1] :] = np.eye(len(others))
+    values, vectors = np.linalg.eigh(free.T @ scaled @ free)
+    regular = values > MIN_INFORMATION  # far from the solution rounding may leave less
+    return free, vectors[:, regular] / np.sqrt(values[regular])
+
+
+def least_information(information: np.ndarray, tolerance: np.ndarray) -> float:
+    """Smallest eigenvalue of `information` (B, B) in units of `tolerance` (B,)."""
+    return float(np.linalg.eigvalsh(tolerance[:, None] * information * tolerance).min(initial=np.inf))
+
+
+def essential_information(information: np.ndarray, tolerance: np.ndarray, layout: Layout) -> float:
+    """`least_information` without the rows and columns of nuisance parameters, which their priors bound."""
+    essential = layout.essential
+    return least_information(information[np.ix_(essential, essential)], tolerance[essential])
+
+
+def complement(fixed_directions: np.ndarray, n: int) -> np.ndarray:
+    """Orthonormal basis (n, n - m) of the orthogonal complement of the columns of `fixed_directions` (n, m)."""
+    if not fixed_directions.size:
+        return np.eye(n)
+    full, _, _ = np.linalg.svd(fixed_directions, full_matrices=True)
+    return full[:, fixed_directions.shape[1] :]
+
+
+def restricted_root(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
+    """Root A (B, n) of the `restricted_inverse` A A^T; arguments as there."""
+    free = complement(fixed_directions, len(information))
+    values, vectors = np.linalg.eigh(free.T @ information @ free)
+    return free @ vectors / np.sqrt(np.maximum(values, MIN_INFORMATION))
+
+
+def restricted_inverse(information: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
+    """Inverse (B, B) of `information` (B, B) within the directions orthogonal to the orthonormal `fixed_directions` (B,
+    m); all in tolerance units."""
+    root = restricted_root(information, fixed_directions)
+    return root @ root.T
+
+
+def calib_draws(
+    information: np.ndarray,
+    tolerance: np.ndarray,
+    fixed_directions: np.ndarray,
+    white: np.ndarray,
+    essential: np.ndarray | None = None,
+) -> np.ndarray:
+    """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
+    that `calib_step` fixes are zero. The root of the covariance is symmetric: signs of eigenvectors do not matter."""
+    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    axes = free @ root
+    return tolerance[:, None] * (axes @ ((axes / np.linalg.norm(axes, axis=0)).T @ white))
+
 
 T = TypeVar("T")
 N_THREADS = 2  # one per piece of the chain; more pieces would need more separators
@@ -390,3 +485,174 @@ def solve(
         pieces, eliminations, n_keyframes, shared, shared_side, information, tolerance, fixed_directions, essential
     )
     return Solution.of(factors, reduced[:, n_calib])
+
+
+# Compiled block Cholesky elimination of a chain of keyframes with calibration parameters, and its back substitution
+# (`arrowhead.py`).
+
+
+@njit(cache=True, nogil=True)
+def forward_solve(L, X):
+    """X <- L^-1 X."""
+    for i in range(L.shape[0]):
+        for k in range(i):
+            f = L[i, k]
+            for j in range(X.shape[1]):
+                X[i, j] -= f * X[k, j]
+        f = 1.0 / L[i, i]
+        for j in range(X.shape[1]):
+            X[i, j] *= f
+
+
+@njit(cache=True, nogil=True)
+def _subtract_product(A, B, X):
+    """X <- X - A^T B."""
+    for k in range(A.shape[0]):
+        for i in range(A.shape[1]):
+            f = A[k, i]
+            if f != 0.0:
+                for j in range(B.shape[1]):
+                    X[i, j] -= f * B[k, j]
+
+
+@njit(cache=True, nogil=True)
+def _transpose(A):
+    """A (n, n) <- A^T."""
+    for i in range(A.shape[0]):
+        for j in range(i):
+            A[i, j], A[j, i] = A[j, i], A[i, j]
+
+
+@njit(cache=True, nogil=True)
+def eliminate_chain(diagonal, upper, side, forwards, keep):
+    """Block Cholesky factorisation in place, from the first keyframe on or, not `forwards`, from the last. With `keep`
+    the final keyframe is only updated. Returns False if a block is not positive definite.
+
+    Afterwards diagonal holds L_k, upper L_k^-1 T[k, next] (transposed before, when running backwards), and side L_k^-1
+    side.
+    """
+    n = diagonal.shape[0]
+    for step in range(n):
+        k = step if forwards else n - 1 - step
+        if step == n - 1 and keep:
+            return True
+        if not cholesky(diagonal[k]):
+            return False
+        forward_solve(diagonal[k], side[k])
+        if step < n - 1:
+            after = k + 1 if forwards else k - 1
+            link = upper[k] if forwards else upper[k - 1]
+            if not forwards:
+                _transpose(link)
+            forward_solve(diagonal[k], link)
+            _subtract_product(link, link, diagonal[after])
+            _subtract_product(link, side[k], side[after])
+    return True
+
+
+@njit(cache=True, nogil=True)
+def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain):
+    """Back substitution with the factors of `eliminate_chain`: fills chain (n, 15). With `keep` the final keyframe's
+    step is an input.
+
+    calib (B + 1,): step of the calibration parameters, and the factor of the gradient (1 solves, 0 samples). white (n,
+    15): further right-hand side after forward substitution.
+    """
+    n = diagonal.shape[0]
+    for step in range(n - 2 if keep else n - 1, -1, -1):
+        k = step if forwards else n - 1 - step
+        L = diagonal[k]
+        for i in range(L.shape[0]):
+            s = -white[k, i]
+            for j in range(len(calib)):
+                s += side[k, i, j] * calib[j]
+            chain[k, i] = -s
+        if step < n - 1:
+            after = k + 1 if forwards else k - 1
+            link = upper[k] if forwards else upper[k - 1]
+            for i in range(L.shape[0]):
+                for j in range(L.shape[0]):
+                    chain[k, i] -= link[i, j] * chain[after, j]
+        for i in range(L.shape[0] - 1, -1, -1):
+            s = chain[k, i]
+            for j in range(i + 1, L.shape[0]):
+                s -= L[j, i] * chain[k, j]
+            chain[k, i] = s / L[i, i]
+
+
+@njit(cache=True, nogil=True)
+def damp(diagonal, damping):
+    """Multiplies the diagonal elements of all blocks by 1 + damping (Marquardt)."""
+    for k in range(diagonal.shape[0]):
+        for i in range(diagonal.shape[1]):
+            diagonal[k, i, i] *= 1.0 + damping
+
+
+# Gaussian priors on calibration parameters, and a broad prior on the biases at the first keyframe of each recording.
+
+# Standard deviations of gyroscope [rad/s] and accelerometer [m/s^2] biases, far wider than the turn-on bias of any IMU.
+# The prior keeps biases defined without motion.
+FIRST_BIAS_SIGMA = np.array([0.5] * 3 + [3.0] * 3)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Gaussian prior on one block: mean `value` and `sigma` (n,), SI units or px.
+
+    The residual is (x - value) / sigma. For rotations it is Log(value^T R) / sigma, with the Jacobian J_r^-1 / sigma.
+    """
+
+    block: Block
+    value: np.ndarray
+    sigma: np.ndarray
+
+    def residual(self, state: State) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened residual (n,) and its Jacobian (n, n)."""
+        x = state.values[self.block.key]
+        if self.block.kind == "rotation":
+            error = so3.log(np.ascontiguousarray(self.value.T @ x))
+            return error / self.sigma, so3.right_jacobian_inverse(error) / self.sigma[:, None]
+        return (x - self.value) / self.sigma, np.diag(1.0 / self.sigma)
+
+    def accumulate(self, state: State, piece: Piece, sums: bool = True) -> float:
+        """Adds the prior to the sums of `piece`, unless only the cost is wanted; returns half its chi^2."""
+        r, J = self.residual(state)
+        columns = self.block.columns
+        if sums:
+            piece.calib[np.ix_(columns, columns)] += J.T @ J
+            piece.calib[columns, -1] += J.T @ r
+            piece.calib[-1, columns] += J.T @ r
+        return 0.5 * float(r @ r)
+
+
+def sums_of_priors(priors: Sequence[Prior], state: State, n_calib: int) -> tuple[float, np.ndarray, np.ndarray]:
+    """Half the chi^2 of `priors` at `state`, and their gradient (B,) and information (B, B) on the calibration
+    parameters."""
+    piece = Piece.zeros(0, 0, n_calib)
+    cost = sum(p.accumulate(state, piece) for p in priors)
+    return cost, piece.calib[:-1, -1], piece.calib[:-1, :-1]
+
+
+def without_priors(information: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """Information (B, B) of the calibration parameters at `state`, with that of `priors` subtracted."""
+    return information - sums_of_priors(priors, state, len(information))[2]
+
+
+def variance_of_priors(covariance: np.ndarray, priors: Sequence[Prior], state: State) -> np.ndarray:
+    """Variances (B,) that errors of the prior means contribute to the diagonal of the covariance `covariance` (B, B):
+    diag(C W C) with C = `covariance` and the information W of `priors`. Measurement noise contributes the rest."""
+    information = sums_of_priors(priors, state, len(covariance))[2]
+    return np.einsum("ij,jk,ki->i", covariance, information, covariance, optimize=True)
+
+
+def accumulate_bias_prior(
+    state: State, piece: Piece, sums: bool = True, centre: np.ndarray | None = None, keyframe: int = 0
+) -> float:
+    """Adds the broad prior on the biases at `keyframe`, with mean `centre` (6,) or zero, to `piece`; returns half its
+    chi^2."""
+    r = (state.bias[keyframe] - (0.0 if centre is None else centre)) / FIRST_BIAS_SIGMA
+    if sums:
+        index, k = np.arange(9, 15), keyframe - piece.first
+        piece.diagonal[k, index, index] += 1.0 / FIRST_BIAS_SIGMA**2
+        piece.side[k, 9:15, -1] += r / FIRST_BIAS_SIGMA
+    return 0.5 * float(r @ r)

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from icalib.geometry import planes, so3
+from icalib.geometry.planes import tangents
 
 KEYFRAME_DIM = 15  # tangent dimensions of a keyframe
 POSE_DIM = 6  # of these, rotation and position
@@ -190,3 +191,23 @@ class State:
         if block.kind == "tilt":
             return so3.exp(np.append(d, 0.0)) @ old
         return planes.moved_and_turned(old, d, turn) if block.kind == "plane" else old + d
+
+
+# Planes of the scene as arrays for compiled kernels.
+
+
+class Planes(NamedTuple):
+    """P planes in the world: unit normal (P, 3), tangents (P, 2, 3) across it, and a point (P, 3) on each [m]. columns
+    (P, 3): calibration columns, -1 where fixed."""
+
+    normal: np.ndarray
+    tangents: np.ndarray
+    point: np.ndarray
+    columns: np.ndarray
+
+    @classmethod
+    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
+        """Planes `keys` with their values in `state`."""
+        value = np.array([state.values[key] for key in keys])
+        across = np.array([tangents(v[:3]) for v in value])
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)

@@ -8,10 +8,10 @@ from rich.text import Text
 
 from icalib.result import Calibration, relative_poses
 from icalib.result.quantities import NEAR_LOCK, NOT_COUNTED, TURNS, Row, format_number, rpy_deg, table_rows
-from icalib.result.summary import body_name, reference_name
+from icalib.result.saving import body_name, reference_name
 from icalib.result.verdict import AUXILIARY, TOO_UNCERTAIN, UNUSABLE, WORST_FIRST, counted, tolerance, worst
 from icalib.rig import LENS
-from icalib.rig.kinds import ALL_SPECS
+from icalib.rig.rig import ALL_SPECS
 from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 
 TOLERANCES = ("rotation_tolerance_deg", "translation_tolerance_m", "time_tolerance_s", "pixel_tolerance")

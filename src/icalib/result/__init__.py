@@ -2,8 +2,11 @@
 
 from icalib.result.calibration import (
     Calibration,
+    CrossValidation,
     Iteration,
     ParameterGroup,
+    Plane,
+    PredictedFit,
     RecordingSpan,
     SensorFit,
     Trajectory,
@@ -11,12 +14,17 @@ from icalib.result.calibration import (
     Visited,
     by_key,
 )
-from icalib.result.cross_validation import CrossValidation, PredictedFit
-from icalib.result.planes import Plane
-from icalib.result.projection import ProjectionMap, projection_uncertainty, working_distance
-from icalib.result.relative import RelativePose, joint_covariance, relative_pose, relative_poses
 from icalib.result.saving import calibration_files, load_calibration
-from icalib.sensors.records import Residuals, RowResiduals
+from icalib.result.verdict import (
+    ProjectionMap,
+    RelativePose,
+    joint_covariance,
+    projection_uncertainty,
+    relative_pose,
+    relative_poses,
+    working_distance,
+)
+from icalib.sensors.stream import Residuals, RowResiduals
 
 __all__ = [
     "Calibration",

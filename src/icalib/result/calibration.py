@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import platform
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib import import_module
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -13,18 +15,21 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icalib.base.extras import load_pandas
-from icalib.result.cross_validation import CrossValidation
-from icalib.result.planes import Plane
+from icalib.base.files import hash_of
+from icalib.data.measurements import Part
+from icalib.motion.factor import ResidualRows
 from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
-from icalib.rig.kinds import SENSOR_TYPES
+from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors import SENSOR_KINDS
-from icalib.sensors.camera.record import CornerResiduals, ImageResiduals, TrackResiduals
-from icalib.sensors.imu.record import ImuResiduals
-from icalib.sensors.records import Residuals, RowResiduals
+from icalib.sensors.camera.stream import CornerResiduals, ImageResiduals, TrackResiduals
+from icalib.sensors.imu.stream import ImuResiduals
+from icalib.sensors.parameter import AXES
 from icalib.sensors.sensor import MOUNTED_NAMES
+from icalib.sensors.stream import Residuals, RowResiduals, Shapes
 
 if TYPE_CHECKING:
-    from icalib.result.relative import RelativePose
+    from icalib.result.verdict import RelativePose
+
 
 Verdict = Literal["determined", "weak", "too uncertain", "unobservable", "fixed"]
 
@@ -329,7 +334,7 @@ class Calibration:
 
     def _find(self, sensor: str, name: str) -> tuple[ParameterGroup, Any]:
         """The group `name`, and the index of all its entries; or the group with the parameter `name`, and its index."""
-        from icalib.result.summary import parameter_keys
+        from icalib.result.saving import parameter_keys
 
         if self.group_or_none(sensor, name) is None:
             groups = tuple(g for g in self.groups if g.sensor == sensor and g.name not in MOUNTED_NAMES)
@@ -344,7 +349,7 @@ class Calibration:
         `frame` or `sensor` may be the IMU. `np.asarray` of the returned pose is the 4x4 matrix. Raises KeyError, which
         lists the sensors.
         """
-        from icalib.result.relative import relative_pose
+        from icalib.result.verdict import relative_pose
 
         known = list(dict.fromkeys([self.reference, *self.mounted]))
         for name in (frame, sensor):
@@ -354,7 +359,7 @@ class Calibration:
 
     def summary(self) -> str:
         """Verdict, reasons, and a table of all parameters with standard deviations and verdicts, as text."""
-        from icalib.result.text import summary_text
+        from icalib.result.quantities import summary_text
 
         return summary_text(self)
 
@@ -379,12 +384,12 @@ class Calibration:
         write_sealed(Path(path), printable(import_module("icalib.report").report_html(self)))  # a higher layer
 
     def __repr__(self) -> str:
-        from icalib.result.text import one_line
+        from icalib.result.quantities import one_line
 
         return one_line(self)
 
     def _repr_html_(self) -> str:
-        from icalib.result.text import summary_html
+        from icalib.result.quantities import summary_html
 
         return summary_html(self)
 
@@ -404,3 +409,245 @@ class Calibration:
 def by_key(records: Iterable[Residuals]) -> dict[tuple[str, str], Residuals]:
     """Residual records by (sensor, kind), as in `Calibration.residuals`."""
     return {(r.sensor, r.kind): r for r in records}
+
+
+# Two-fold cross-validation of a calibration, and its change if one segment of the recording is left out (jackknife).
+
+SIGNIFICANT = 3.0  # standard deviations of the statistic under pure noise; smaller deviations count as chance
+
+
+@dataclass(frozen=True)
+class PredictedFit:
+    """Fit of one kind of residual in one half (fold) of the recording, with the trajectory optimised each time. inside:
+    with the calibration from both halves. outside: with the calibration from the other half alone. chi2: chi^2; rms: in
+    `unit`, None for residuals without a unit."""
+
+    sensor: str
+    kind: str
+    count: int
+    chi2_inside: float
+    chi2_outside: float
+    rms_inside: float | None = None
+    rms_outside: float | None = None
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """Two-fold cross-validation: the odd and the even ones of `segments` segments make the two halves (folds).
+
+    directions: number of directions of the calibration that both halves determine. excess: chi^2 of both halves, each
+    with the calibration of the other half, minus that with the calibration of both. expected, spread: mean and standard
+    deviation of `excess` for noise of the stated sizes. shift (G, B): change of the calibration without each of the G
+    segments [SI]; shift_sigma (G, B): its formal standard deviation.
+    """
+
+    segments: int
+    directions: int
+    excess: float
+    expected: float
+    spread: float
+    fits: tuple[PredictedFit, ...]
+    shift: np.ndarray
+    shift_sigma: np.ndarray
+
+    @property
+    def factor(self) -> float:
+        """Factor by which the formal standard deviations are too small; near 1 if noise of the stated sizes is the only
+        error."""
+        return float(np.sqrt(max(self.excess, 0.0) / self.expected))
+
+    @property
+    def optimistic(self) -> bool:
+        """Whether the formal standard deviations are significantly too small."""
+        return self.excess > self.expected + SIGNIFICANT * self.spread
+
+    @property
+    def pessimistic(self) -> bool:
+        """Whether the formal standard deviations are significantly too large."""
+        return self.excess < self.expected - SIGNIFICANT * self.spread
+
+    @property
+    def whitened(self) -> np.ndarray:
+        """(G, B) `shift` over `shift_sigma`: standard normal if noise is the only error; NaN if the sigma is 0."""
+        return self.shift / np.where(self.shift_sigma > 0.0, self.shift_sigma, np.nan)
+
+
+# Planes of the scene.
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane of the scene on which LiDAR points lie, in the world frame. normal: unit vector (3,); point: (3,) a point
+    on the plane [m]; count: number of points on it, over all LiDARs."""
+
+    name: str
+    normal: np.ndarray
+    point: np.ndarray
+    count: int
+
+
+# Checks dtypes and shapes of arrays of a result that was read from files, which may have been edited.
+
+_WORDS = {"f": "decimal", "iu": "whole", "b": "boolean"}  # by accepted values of numpy's dtype.kind
+_TRAJECTORY: Shapes = {
+    "seconds": ("f", "n"),
+    "rotation": ("f", "n", 3, 3),
+    "position": ("f", "n", 3),
+    "velocity": ("f", "n", 3),
+    "gyro_bias": ("f", "n", 3),
+    "accel_bias": ("f", "n", 3),
+}
+
+
+def check_arrays(c: Calibration) -> None:
+    """Raise ValueError, naming the array, if a dtype is wrong or a shape is inconsistent with the other arrays.
+
+    Shapes of the covariance and of the null space are not checked here.
+    """
+    _check_kind("the covariance", c.covariance, "f")
+    _check_kind("the null space", c.null_space, "f")
+    for (sensor, _), record in c.residuals.items():
+        _check(record, sensor, record.shapes)
+    _check(c.trajectory, Trajectory.__name__, _TRAJECTORY)
+
+
+def _check(part: Any, what: str, shapes: Shapes) -> None:
+    """Check the arrays of one object against `shapes`, in which equal names of axes are equal lengths."""
+    lengths: dict[str, int] = {"labels": len(getattr(part, "labels", ()))}
+    for name, (kind, *axes) in shapes.items():
+        array = getattr(part, name)
+        _check_kind(f"{name} of {what}", array, str(kind))
+        if array.ndim != len(axes) or any(
+            n != (lengths.setdefault(a, n) if isinstance(a, str) else a) for a, n in zip(axes, array.shape, strict=True)
+        ):
+            raise ValueError(f"{name} of {what} has shape {array.shape}, which does not fit the rest")
+    if "edges" in lengths:
+        start, images, n = part.start, lengths["images"], lengths["n"]
+        if len(start) != images + 1 or start[0] != 0 or start[-1] != n or (np.diff(start) < 0).any():
+            raise ValueError(f"start of {what} does not divide its points among its images")
+
+
+def _check_kind(what: str, array: np.ndarray, kinds: str) -> None:
+    if array.dtype.kind not in kinds:
+        raise ValueError(f"{what} holds {array.dtype}, not {_WORDS[kinds]} values")
+
+
+# Provenance of a result: hashes of its input files, and versions of the software.
+
+_LIBRARIES = ("numpy", "numba")
+
+
+def provenance(files: list[Path]) -> dict[str, str]:
+    """SHA-256 of the content of each file, in hexadecimal, by path."""
+    return {str(f): hash_of(f).hexdigest() for f in files}
+
+
+def versions() -> dict[str, str]:
+    """Versions of icalib, Python and the libraries that the numbers depend on."""
+    from icalib import __version__
+
+    return {"icalib": __version__, "python": platform.python_version()} | {n: version(n) for n in _LIBRARIES}
+
+
+# The clock of a result: recordings follow one another with a pause of `PAUSE_S` between them.
+
+PAUSE_S = 1.0
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Conversion from the joined clock of the estimator to the clock of the result. parts, spans: the n recordings on
+    the first and on the second. shift (n,): added to the times of each recording [s]."""
+
+    parts: tuple[Part, ...]
+    spans: tuple[RecordingSpan, ...]
+    shift: np.ndarray
+
+    @classmethod
+    def of(cls, parts: tuple[Part, ...], image_times: Mapping[str, np.ndarray], body: str) -> Timeline:
+        """Timeline of recordings `parts`. image_times: times of images on the joined clock [s], by the key of their
+        stream. body: name of the sensor that defines the joined clock."""
+        spans, shift = [], np.zeros(len(parts))
+        for k, part in enumerate(parts):
+            first, last = _extent(part, image_times, body)
+            shift[k] = spans[-1].end + PAUSE_S - first if spans else 0.0
+            origin_ns = part.measurements.origin_ns + round(1e9 * (first - part.begin))
+            spans.append(RecordingSpan(part.name, first + shift[k], last + shift[k], origin_ns))
+        return cls(parts, tuple(spans), shift)
+
+    def on_result_clock(self, seconds: np.ndarray, recording: np.ndarray) -> np.ndarray:
+        """(n,) times on the clock of the result, from times (n,) on the joined clock and recording indices (n,) [s]."""
+        return seconds + self.shift[recording]
+
+    def recordings_of(self, stream: str) -> np.ndarray:
+        """(N,) index of the recording of each stamp of the stream with the key `stream`."""
+        counts = [p.rows[stream].stop - p.rows[stream].start for p in self.parts]
+        return np.repeat(np.arange(len(counts)), counts)
+
+    def recording_of(self, seconds: np.ndarray) -> np.ndarray:
+        """(n,) index of the recording in which each of `seconds` (n,) on the joined clock lies. The body sensor must
+        have been running at these times."""
+        return np.searchsorted([p.begin for p in self.parts[1:]], seconds, side="right")
+
+    def words(self, second: float) -> str:
+        """Text for an instant on the joined clock [s]: seconds since the start of its recording (the nearest image if
+        it has no clock), and the name of that if there are several. The body sensor must have been running."""
+        part = self.parts[int(self.recording_of(np.array(second)))]
+        m, since = part.measurements, second - part.begin
+        text = f"{since:.3f} s" if m.has_clock else f"image {m.cameras[0].nearest(since)}"
+        return text if len(self.parts) == 1 else f"{text} of {part.name}"
+
+    @property
+    def can_be_cut(self) -> bool:
+        """Whether --from and --to select a part: there is one recording, and it has a clock."""
+        return len(self.parts) == 1 and self.parts[0].measurements.has_clock
+
+
+def _extent(part: Part, image_times: Mapping[str, np.ndarray], body: str) -> tuple[float, float]:
+    """Times of the first and the last measurement of a recording, on the joined clock [s]."""
+    images = [times[part.rows[key]] for key, times in image_times.items()]
+    if not images or part.measurements.imu is not None:  # else the clock is that of a camera
+        images.append(part.begin + part.measurements.streams[body].seconds)
+    times = np.concatenate(images)
+    return float(times.min()), float(times.max())
+
+
+# Converts residuals of a factor of the estimator to a record in the result.
+
+CLIP = 4.0  # standard deviations, so that outliers do not dominate the correlation
+
+
+def row_record(
+    kind: str, rows: Sequence[ResidualRows], timeline: Timeline, labels: Mapping[str, tuple[str, ...]] | None = None
+) -> RowResiduals:
+    """One record of all residuals `rows` of one factor, which have the same times. kind: name of the record. labels:
+    names of the columns by kind of residual; the default is the kind, followed by the axis (or index) if there are
+    several columns."""
+    names = {r.kind: _labels(r) for r in rows} | dict(labels or {})
+    columns = [(label, r.unit) for r in rows for label in names[r.kind]]
+    seconds = timeline.on_result_clock(rows[0].seconds, timeline.recording_of(rows[0].seconds))
+    residual, whitened = (np.hstack([getattr(r, name) for r in rows]) for name in ("residual", "whitened"))
+    return RowResiduals(
+        rows[0].sensor,
+        kind,
+        tuple(label for label, _ in columns),
+        tuple(unit for _, unit in columns),
+        seconds,
+        residual,
+        whitened,
+    )
+
+
+def _labels(r: ResidualRows) -> tuple[str, ...]:
+    n = r.residual.shape[1]
+    if n == 1:
+        return (r.kind,)
+    return tuple(f"{r.kind} {mark}" for mark in (AXES if n == len(AXES) else range(1, n + 1)))
+
+
+def lag_one_correlation(whitened: np.ndarray) -> float:
+    """Lag-one autocorrelation of whitened residuals (n, m) over all columns, with values clipped at `CLIP`; 0 if n <
+    2."""
+    clipped = np.clip(whitened, -CLIP, CLIP)
+    return float((clipped[1:] * clipped[:-1]).sum() / max((clipped**2).sum(), 1e-30))

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import floor, isfinite, log10
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from html import escape
+from math import floor, inf, isfinite, log10, radians
+from typing import Any
 
 import numpy as np
+from scipy.linalg import orth
 
-from icalib.geometry import euler
-from icalib.result.body_frame import in_body_frame
-from icalib.result.excess import largest_dof
-from icalib.result.relative import joint_covariance
-from icalib.result.verdict import counted, worst
+from icalib.geometry import so3
+from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
+from icalib.result.verdict import (
+    by_size,
+    counted,
+    in_null_space,
+    joint_covariance,
+    pose_groups,
+    relative_jacobian,
+    tolerance,
+    worst,
+)
 from icalib.rig import LENS
-from icalib.rig.kinds import ONE
-from icalib.sensors.parameter_spec import display_unit
-from icalib.sensors.sensor import ROTATION
-
-if TYPE_CHECKING:
-    from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
+from icalib.rig.rig import ONE
+from icalib.sensors.parameter import display_unit
+from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 TURNS = ("roll", "pitch", "yaw")
 NOT_COUNTED = "In brackets: without weight in the verdict, as auxiliary, with a prior, or of a lens that projects well."
@@ -88,7 +95,7 @@ def records(c: Calibration) -> list[dict[str, Any]]:
         labels, values, std, verdicts = g.labels, _values(g, 1.0), g.std, g.verdict
         if g.name == ROTATION.name:
             labels, verdicts = TURNS, (worst(g.verdict),) * len(TURNS)
-            values, std = euler.rpy(g.value).tolist(), euler.rpy_std(g.value, joint_covariance(c, [g]))
+            values, std = so3.rpy(g.value).tolist(), so3.rpy_std(g.value, joint_covariance(c, [g]))
         for label, value, sigma, verdict in zip(labels, values, std.tolist(), verdicts, strict=True):
             about = {"sensor": g.sensor, "group": g.name, "entry": label or g.name, "value": value}
             out.append(about | {"std": sigma, "unit": g.unit, "verdict": verdict})
@@ -108,8 +115,8 @@ def nontrivial_groups(calibration: Calibration) -> list[ParameterGroup]:
 
 def rpy_deg(R: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(3,) roll, pitch, yaw [deg] with R = Rz(yaw) Ry(pitch) Rx(roll), as in the rig file, and (3,) their standard
-    deviations, see `euler.rpy_std`. covariance (3, 3): of the rotation about the sensor's axes [rad^2]."""
-    return np.rad2deg(euler.rpy(R)), np.rad2deg(euler.rpy_std(R, covariance))
+    deviations, see `so3.rpy_std`. covariance (3, 3): of the rotation about the sensor's axes [rad^2]."""
+    return np.rad2deg(so3.rpy(R)), np.rad2deg(so3.rpy_std(R, covariance))
 
 
 def format_number(value: float, digits: int = 2) -> str:
@@ -199,3 +206,231 @@ def _value_text(value: float | None, std: float) -> str:
     if not isfinite(std) or std <= 0.0 or not 1e-9 < std < 1e3:
         return f"{value:.6g}"
     return f"{value:.{max(0, 1 - floor(log10(std)))}f}"
+
+
+# Converts a result to poses relative to the sensor `body` of the rig file, if that is not the reference.
+
+_POSE = (ROTATION, TRANSLATION)
+_NAMES = tuple(spec.name for spec in _POSE)
+_SI = {"rotation_tolerance_deg": radians(1.0), "translation_tolerance_m": 1.0}  # SI value of one unit of each setting
+
+
+def in_body_frame(c: Calibration) -> Calibration:
+    """`c` with rotation and translation of every sensor as T_body_sensor; `c` itself if `body` is `reference`.
+
+    The body gets the identity as a fixed pose. An IMU that is not the body gets a pose. The covariance is J C J^T, to
+    first order. The empirical factor of a pose is the ratio of its standard deviations with and without the factors of
+    its source groups. The null space becomes span(J N). Verdicts on poses follow from the null space and the standard
+    deviations, as in `c`. All other groups are unchanged; time offsets stay relative to the reference.
+    """
+    if c.body == c.reference:
+        return c
+    groups, row_blocks, names = list[ParameterGroup](), [np.zeros((0, len(c.covariance)))], list[str]()
+    for group, rows in _reframed(c):
+        columns = tuple(range(len(names), len(names) + len(rows))) if rows.any() else None
+        groups.append(replace(group, columns=columns))
+        if columns is not None:
+            row_blocks.append(rows)
+            names += [f"{group.sensor}.{group.name}.{label}" for label in group.labels]
+    J = np.vstack(row_blocks)
+    null = _null_space(c, J, groups)
+    return replace(
+        c,
+        groups=tuple(_with_null_space(c, g, null) for g in groups),
+        covariance=J @ c.covariance @ J.T,
+        covariance_names=tuple(names),
+        null_space=null,
+    )
+
+
+def _reframed(c: Calibration) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
+    """Each group in the frame of the body, with its Jacobian (n, B) by the estimated parameters of `c`. The pose of the
+    IMU comes first."""
+    sensors = (*(() if c.imu is None else (c.imu,)), *c.mounted)
+    moved = {(name, g.name): (g, rows) for name in sensors for g, rows in _pose_in_body(c, name)}
+    yield from (moved.pop((c.imu, name)) for name in _NAMES if c.imu is not None)
+    for group in c.groups:
+        yield moved.get((group.sensor, group.name), (group, _rows(c, group)))
+
+
+def _pose_in_body(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup, np.ndarray]]:
+    """Rotation and translation of T_body_sensor as groups, with their Jacobians (3, B) by the estimated parameters of
+    `c`."""
+    T, J = c.T_body_sensor(sensor), np.zeros((6, len(c.covariance)))
+    if sensor != c.body:
+        pair = [*pose_groups(c, c.body), *pose_groups(c, sensor)]
+        J = relative_jacobian(c, c.body, sensor) @ np.vstack([_rows(c, g) for g in pair])
+    scale = _scales(c)
+    for spec, value, rows in zip(_POSE, (T[:3, :3], T[:3, 3]), (J[:3], J[3:]), strict=True):
+        formal, std = (np.sqrt(np.einsum("ij,jk,ik->i", r, c.covariance, r)) for r in (rows, rows * scale))
+        sizes, by_guess = std / _allowed(c, spec.tolerance), _by_guess(c, rows)
+        verdict: tuple[Verdict, ...] = tuple(
+            "fixed" if s == 0.0 else by_size(s if c.converged else inf, g) for s, g in zip(sizes, by_guess, strict=True)
+        )
+        factor = np.divide(std, formal, out=np.ones(3), where=formal > 0.0)
+        mode = "free" if rows.any() else "fixed"
+        group = ParameterGroup(
+            sensor, spec.name, spec.labels, spec.unit, value, formal, std, verdict, mode, factor=factor
+        )
+        yield group, rows
+
+
+def _by_guess(c: Calibration, rows: np.ndarray) -> np.ndarray:
+    """(n,) whether unobservable parameters are most of the variance, for n rows of a Jacobian (n, B)."""
+    columns = [k for g in c.groups for k, v in zip(g.columns or (), g.verdict, strict=False) if v == "unobservable"]
+    some = np.zeros_like(rows)
+    some[:, columns] = rows[:, columns]
+    total, part = (np.einsum("ij,jk,ik->i", r, c.covariance, r) for r in (rows, some))
+    return part > 0.5 * total
+
+
+def _rows(c: Calibration, group: ParameterGroup | None) -> np.ndarray:
+    """(n, B) selection matrix of the columns of the group: zeros if the group is fixed, and (3, B) zeros for a None."""
+    rows = np.zeros((3 if group is None else len(group.labels), len(c.covariance)))
+    if group is not None and group.columns is not None:
+        rows[np.arange(len(group.columns)), list(group.columns)] = 1.0
+    return rows
+
+
+def _scales(c: Calibration) -> np.ndarray:
+    """(B,) empirical factor of each estimated parameter, at least 1."""
+    scale = np.ones(len(c.covariance))
+    for g in c.groups:
+        if g.columns is not None and g.factor is not None:
+            scale[list(g.columns)] = np.maximum(g.factor, 1.0)
+    return scale
+
+
+def _null_space(c: Calibration, J: np.ndarray, groups: Sequence[ParameterGroup]) -> np.ndarray:
+    """(B', m) orthonormal basis of the null space of the parameters of `groups`, in tolerance units. J (B', B): their
+    Jacobian by the estimated parameters of `c`."""
+    if not c.null_space.size:
+        return np.zeros((len(J), 0))
+    before, after = _pose_tolerances(c, c.groups, J.shape[1]), _pose_tolerances(c, groups, len(J))
+    return orth(J * before / after[:, None] @ c.null_space)
+
+
+def _pose_tolerances(c: Calibration, groups: Sequence[ParameterGroup], size: int) -> np.ndarray:
+    """(size,) tolerances of the parameters in `groups`: of rotations [rad] and translations [m]. All other entries are
+    1, as J leaves these parameters unchanged."""
+    tolerances = np.ones(size)
+    for spec in _POSE:
+        columns = [k for g in groups if g.name == spec.name for k in g.columns or ()]
+        tolerances[columns] = _allowed(c, spec.tolerance)
+    return tolerances
+
+
+def _allowed(c: Calibration, setting: object) -> float:
+    """Tolerance of rotations [rad] or translations [m], from the setting of this name."""
+    assert isinstance(setting, str)
+    return tolerance(c, setting) * _SI[setting]
+
+
+def _with_null_space(c: Calibration, group: ParameterGroup, null: np.ndarray) -> ParameterGroup:
+    """The group with verdict unobservable on each component of a sensor's pose that lies in the null space (B', m)."""
+    if group.name not in _NAMES or group.columns is None or group.sensor not in c.rig["sensors"]:
+        return group
+    is_null = in_null_space(null)[list(group.columns)]
+    verdict: tuple[Verdict, ...] = tuple(
+        "unobservable" if n else v for n, v in zip(is_null, group.verdict, strict=True)
+    )
+    return replace(group, verdict=verdict)
+
+
+# Residuals that are larger or smaller than the stated noise predicts.
+#
+# The post-fit degrees of freedom are estimated by sampling. If they are few compared with the number of residuals, the
+# estimate is unreliable. This happens if the stated noise of an IMU is far too small, so that the trajectory fits that
+# noise. The ratio is then computed with the largest number of degrees of freedom within the sampling error, as a lower
+# bound.
+
+LARGE_CHI2 = 2.0  # chi^2 per post-fit degree of freedom above which a warning is given
+# Ratio of residuals to the stated noise above which standard deviations are meaningless. If the stated noise of a
+# simulated IMU is ten times too small, the ratio is 3 to 5, and errors reach 12 standard deviations.
+FAR_BEYOND = 4.0
+SMALL_CHI2 = 0.5  # chi^2 per post-fit degree of freedom below which a warning is given
+SAMPLED_DOF = 3.0  # largest error of sampled degrees of freedom, over the square root of the number of residuals
+
+
+def dof_known(fit: SensorFit) -> bool:
+    """Whether the degrees of freedom exceed their sampling error of `SAMPLED_DOF` * sqrt(count)."""
+    return fit.dof > SAMPLED_DOF * np.sqrt(fit.count)
+
+
+def largest_dof(fit: SensorFit) -> float:
+    """Upper bound of the degrees of freedom, by their sampling error; at least 1."""
+    return max(min(max(fit.dof, 0.0) + SAMPLED_DOF * np.sqrt(fit.count), fit.count), 1.0)
+
+
+def excess(fit: SensorFit) -> float:
+    """Ratio of residuals to the stated noise, sqrt(chi^2 / dof); a lower bound if not `dof_known`. 1 if chi^2 / dof is
+    below `LARGE_CHI2`."""
+    chi2_per_dof = fit.chi2 / (fit.dof if dof_known(fit) else largest_dof(fit))
+    return float(np.sqrt(chi2_per_dof)) if chi2_per_dof > LARGE_CHI2 else 1.0
+
+
+def is_small(fit: SensorFit) -> bool:
+    """Whether the residuals are much smaller than the stated noise predicts."""
+    return dof_known(fit) and fit.chi2 / max(fit.dof, 1.0) < SMALL_CHI2
+
+
+def ratio(fit: SensorFit) -> float:
+    """Ratio of residuals to the stated noise, sqrt(chi^2 / dof), for known degrees of freedom."""
+    return float(np.sqrt(max(fit.chi2, 0.0) / fit.dof))
+
+
+def times(fit: SensorFit) -> str:
+    """`excess` as text, such as "3.3x" or "at least 3.3x"."""
+    return f"{'' if dof_known(fit) else 'at least '}{excess(fit):.2g}x"
+
+
+# A calibration as text and as HTML, for the Python prompt and for notebooks.
+
+_HEAD = ("sensor", "parameter", "value", "std", "unit", "verdict")
+_RIGHT = (False, False, True, True, False, False)  # alignment of the columns: numbers are right-aligned
+_COLOURS = {"too uncertain": "#c62828", "unobservable": "#c62828", "weak": "#b26a00"}
+
+
+def one_line(c: Calibration) -> str:
+    """One line with the sensors, the verdict and the number of reasons."""
+    sensors = ", ".join(c.rig["sensors"])
+    count = len(c.reasons)
+    why = f", {count} reason{'s' * (count > 1)}" if count else ""
+    return f"<Calibration of {sensors}: {c.verdict}{why}; see .summary()>"
+
+
+def summary_text(c: Calibration) -> str:
+    """The verdict with its reasons, and a table of all parameters with standard deviations and verdicts."""
+    table = [_HEAD, *(_cells(row) for row in table_rows(c))]
+    widths = [max(len(cells[k]) for cells in table) for k in range(len(_HEAD))]
+    lines = []
+    for cells in table:
+        padded = (x.rjust(w) if right else x.ljust(w) for x, w, right in zip(cells, widths, _RIGHT, strict=True))
+        lines.append("  ".join(padded).rstrip())
+    return "\n".join([f"Verdict: {c.verdict}", *_reasons(c), "", *lines])
+
+
+def summary_html(c: Calibration) -> str:
+    """The verdict with its reasons, and the table of `summary_text`, as HTML."""
+    head = "".join(f"<th>{name}</th>" for name in _HEAD)
+    body = "".join(f"<tr>{''.join(_html_cells(row))}</tr>" for row in table_rows(c))
+    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in c.reasons)
+    listed = f"<ol>{reasons}</ol>" if reasons else ""
+    return (
+        f"<p><b>Verdict: {c.verdict}</b></p>{listed}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+    )
+
+
+def _reasons(c: Calibration) -> list[str]:
+    return [f"Reason {k}: {reason}" for k, reason in enumerate(c.reasons, 1)]
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    return row.sensor, row.name, row.value, row.std, row.unit, row.verdict
+
+
+def _html_cells(row: Row) -> list[str]:
+    colour = _COLOURS.get(row.verdict, "")
+    styles = ["text-align: right" if right else "text-align: left" for right in _RIGHT]
+    styles[-1] += f"; color: {colour}" if colour else ""
+    return [f'<td style="{style}">{escape(x)}</td>' for style, x in zip(styles, _cells(row), strict=True)]

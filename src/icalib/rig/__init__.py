@@ -1,12 +1,10 @@
 """The rig: definitions of its sensors, their parameters, the target and the settings of the estimator."""
 
-from icalib.rig.rig import Rig, by_name
-from icalib.rig.settings import Loss, Scheme, Settings
+from icalib.rig.rig import Loss, Rig, Scheme, Settings, by_name
 from icalib.sensors.camera.spec import LENS, TRACK_IMAGES, Camera
 from icalib.sensors.imu.spec import BY_CLASS, AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources, prior_words
 from icalib.sensors.lidar.spec import Lidar, PointTime
-from icalib.sensors.parameter import Parameter
-from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.parameter import Parameter, ParameterSpec
 from icalib.sensors.pose.spec import PoseKind, PoseSensor
 from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sensor, TableLayout, TimeUnit
 from icalib.sensors.wheels.spec import (

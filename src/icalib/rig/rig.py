@@ -3,23 +3,106 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from math import radians, sin, sqrt
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
 
+from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
 from icalib.geometry.targets import NoTarget, Target
-from icalib.rig.gravity import ANYWHERE
-from icalib.rig.settings import Settings
-from icalib.sensors import SENSOR_KINDS
+from icalib.rig.scene import SCENE
+from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.imu.spec import ImuSensor
 from icalib.sensors.lidar.spec import Lidar
-from icalib.sensors.parameter import check_fields
+from icalib.sensors.parameter import ToleranceSetting, check_fields
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import ROTATION, Sensor
 from icalib.sensors.wheels.spec import Wheels
+
+# Settings of the estimator: the section `settings` of the rig file.
+
+Scheme = Literal["inertial", "pose", "kinematic"]
+Loss = Literal["none", "huber", "cauchy"]
+Keyframes = Literal["every-image", "first-camera"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of the estimator, as in the rig file (docs/rig-file.md). The defaults suit every rig."""
+
+    scheme: Scheme = "inertial"  # interpolation of poses between keyframes
+    keyframes: Keyframes = "every-image"  # which images get a keyframe; first-camera: as in the iCalib paper
+    loss: Loss = "huber"  # robust loss on corners
+    loss_scale: float = 2.5  # residuals above this many standard deviations are down-weighted
+    outlier_std: float = 4.0  # reject corners this many sigmas above the mean error of their image; 0: none
+    outlier_min_px: float = 1.0  # corners with smaller errors are never rejected
+    bloom: bool = True  # estimate edge bloom (dark edges shifted by blur and response), one value per camera
+    board_shape: bool = True  # estimate deviations of the target from its design
+    blur_noise: bool = True  # corner sigma grows with image speed (motion blur)
+    common_error: bool = False  # corners of an image share a random shift; its sigma is estimated
+    cache_corners: bool = True  # cache detected corners in the user's cache folder
+    segments: int = 8  # number for the block jackknife (empirical factor); 0: no jackknife
+    max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
+    keyframe_spacing_s: float = 0.05  # longest interval between consecutive keyframes
+    # Constraint of tracked points to the planes that LiDARs see, as a standard deviation; 0: no constraint.
+    points_on_planes_m: float = 0.0
+    # The verdict on a parameter is `determined` if its standard deviation is at most its tolerance.
+    rotation_tolerance_deg: float = 0.1
+    translation_tolerance_m: float = 5e-3
+    time_tolerance_s: float = 1e-3
+    pixel_tolerance: float = 1.0  # px, of fx, fy, cx, cy
+
+    def tolerance(self, name: ToleranceSetting) -> float:
+        """Value of the setting `name`, a tolerance, in SI units (angles in rad) or px."""
+        value = float(getattr(self, name))
+        return math.radians(value) if name.endswith("_deg") else value
+
+
+# The magnitude of gravity, and how well it is known.
+
+
+class Gravity(NamedTuple):
+    """Magnitude and its standard deviation [m/s^2]; sigma 0: exact."""
+
+    value: float
+    sigma: float
+
+
+# On the ground of the earth it is 9.780 (equator) to 9.832 (poles), WGS84.
+ANYWHERE = Gravity(9.806, 0.02)
+ANOMALY_SIGMA = 5e-4  # m/s^2: gravity anomalies on land are 50 mGal and less (Pavlis et al., EGM2008, JGR 2012)
+
+
+def gravity_at(latitude_deg: float, height_m: float) -> Gravity:
+    """Normal gravity of WGS84 by Somigliana's formula, with the free-air gradient (NIMA TR8350.2, chapter 4)."""
+    square = sin(radians(latitude_deg)) ** 2
+    at_sea_level = 9.7803253359 * (1.0 + 0.00193185265241 * square) / sqrt(1.0 - 0.00669437999013 * square)
+    return Gravity(at_sea_level - 3.086e-6 * height_m, ANOMALY_SIGMA)
+
+
+def parse_gravity(value: YamlValue) -> Gravity:
+    """Gravity from a number, which is exact, from {prior: VALUE, sigma: SIGMA}, or from {latitude: DEGREES, height:
+    METRES}. Raises RigError naming line and field."""
+    if not value.is_mapping:
+        return Gravity(value.positive(), 0.0)
+    names = ("latitude", "height") if "latitude" in value.entries() else ("prior", "sigma")
+    fields = value.record(names)
+    if names == ("prior", "sigma"):
+        return Gravity(fields["prior"].positive(), fields["sigma"].positive())
+    latitude = fields["latitude"].number()
+    if abs(latitude) > 90.0:
+        fields["latitude"].fail(f"is between -90 and 90 degrees, but is {latitude:g}; correct it.")
+    return gravity_at(latitude, fields["height"].number())
+
+
+def gravity_to_plain(gravity: Gravity) -> Any:
+    """`gravity` as in a rig file."""
+    return {"prior": gravity.value, "sigma": gravity.sigma} if gravity.sigma else gravity.value
+
 
 T = TypeVar("T", bound=Sensor)
 # Names for all sensors of a type: properties of `Rig`, and keyword arguments of `Rig.with_`.
@@ -178,3 +261,13 @@ def _several(value: Sensor | Iterable[Sensor] | None) -> tuple[Sensor, ...]:
     if value is None:
         return ()
     return (value,) if isinstance(value, Sensor) else tuple(value)
+
+
+# Sensor classes by type, and the definitions of all parameters, collected from `SENSOR_KINDS` and `SCENE`.
+
+SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
+_SENSOR_SPECS = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
+ALL_SPECS = tuple(dict.fromkeys((*_SENSOR_SPECS, *SCENE)))  # without duplicates
+
+# Parameter groups with a plural name -> name of a single number, such as radii -> radius.
+ONE = {spec.name: spec.one for spec in ALL_SPECS if spec.one}

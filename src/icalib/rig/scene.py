@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import radians
 
-from icalib.sensors.parameter_spec import AXES, ParameterSpec
+from icalib.sensors.parameter import AXES, ParameterSpec
 from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 # True length / length in the rig file, of all lengths of the target.

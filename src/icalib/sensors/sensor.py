@@ -8,8 +8,7 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, TypeVar
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.parameter import Parameter, check_sizes
-from icalib.sensors.parameter_spec import AXES, ParameterSpec
+from icalib.sensors.parameter import AXES, Parameter, ParameterSpec, check_sizes
 
 T = TypeVar("T")
 TimeUnit = Literal["s", "ms", "us", "ns"]

@@ -11,7 +11,7 @@ from icalib.base.extras import install
 from icalib.base.files import refuse_foreign, sealed, staged, writing
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Markers, Tag, Target
-from icalib.geometry.targets.pattern import Pattern, pattern_of
+from icalib.geometry.targets.boards import Pattern, pattern_of
 
 # Width and height [mm] in portrait; smallest first.
 PAPERS = {

@@ -24,6 +24,6 @@ A kind of sensor has a part in it by functions of its `assess` facet. All are op
 """
 
 from icalib.validation.assess import assess, visited
-from icalib.validation.stated import stated_words
+from icalib.validation.guesses import stated_words
 
 __all__ = ["assess", "stated_words", "visited"]

@@ -3,28 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
+from scipy.special import ndtr, stdtrit
 
+from icalib.estimate.cross_validation import Prediction, predict, shifts
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.gauge import IN_THE_WORLD
-from icalib.estimate.problem.inputs import Inputs, origin_difference
-from icalib.estimate.problem.outcome import Visit
-from icalib.estimate.problem.problem import Problem
-from icalib.estimate.residual_statistics.fit_statistics import fits, raw_sizes
-from icalib.estimate.residual_statistics.inflation import calibration_columns
-from icalib.estimate.residual_statistics.segments import Segments
-from icalib.motion.axes import hardly_turned
-from icalib.observability.contradictions import Contradiction
-from icalib.observability.determination import Determined
-from icalib.observability.words import Observability, observe
-from icalib.optim.calib_block import restricted_inverse
+from icalib.estimate.inputs import Inputs, origin_difference
+from icalib.estimate.problem import IN_THE_WORLD, Problem
+from icalib.estimate.residual_statistics import (
+    Segments,
+    calibration_columns,
+    chi2_by_kind,
+    cluster_covariances,
+    fits,
+    noise_variance,
+    raw_sizes,
+    spread_variance,
+)
+from icalib.estimate.solver import Visit
+from icalib.motion.imu_data import hardly_turned
+from icalib.observability.determination import Contradiction, Determined, Observability, observe
+from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
     Calibration,
+    CrossValidation,
     Iteration,
     ParameterGroup,
+    PredictedFit,
     Residuals,
     SensorFit,
     Trajectory,
@@ -32,18 +41,12 @@ from icalib.result import (
     Visited,
     by_key,
 )
-from icalib.result.provenance import versions
-from icalib.result.row_records import row_record
-from icalib.result.timeline import Timeline
+from icalib.result.calibration import Timeline, row_record, versions
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
-from icalib.validation.all_causes import AssessedEstimate, all_causes
-from icalib.validation.cross_validation import cross_validation
+from icalib.validation.causes import AssessedEstimate, all_causes, scatter_warnings
 from icalib.validation.guesses import guess_notes
-from icalib.validation.misfit import scatter_warnings
-from icalib.validation.notes import notes
-from icalib.validation.variance_parts import ENOUGH_SEGMENTS, VarianceParts, few_factor
 
 
 def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
@@ -298,3 +301,117 @@ def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
     """(n,) empirical factors of all estimated parameters of sensors, without edge bloom."""
     sensor_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
     return np.concatenate([np.ones(0), *(g.factor for g in sensor_groups if g.factor is not None)])
+
+
+# Notes on recordings and sensors, one sentence each.
+
+
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+    """Notes on the recordings, then on each kind of sensor."""
+    for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
+        number, m = f"recording {k}", timeline.parts[k - 1].measurements
+        name = number if span.name == number else f"{number}, {span.name}"
+        timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
+        yield f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}."
+    yield from inputs.measurements.notes
+    yield from call_all_kinds("assess", "notes", inputs, estimate, timeline)
+
+
+# Two-fold cross-validation, in the form of the result.
+
+
+def cross_validation(segments: Segments | None, assumed: Collection[str]) -> CrossValidation | None:
+    """None if the recording cannot be split, or if no parameter is observable in both halves. Sensors in `assumed` get
+    no fits; no sensor does if the solutions of the halves are too far apart for a linearisation."""
+    prediction = None if segments is None else predict(segments)
+    if segments is None or prediction is None:
+        return None
+    fits = tuple(f for f in _fits(segments.problem, prediction) if f.sensor not in assumed) if prediction.linear else ()
+    spread = shifts(segments)
+    return CrossValidation(
+        segments.count,
+        prediction.directions,
+        prediction.excess,
+        prediction.expected,
+        prediction.spread,
+        fits,
+        spread.moved,
+        spread.expected,
+    )
+
+
+def _fits(problem: Problem, prediction: Prediction) -> list[PredictedFit]:
+    """Size of the residuals of each sensor and kind, within a half and predicted by the other half."""
+    inside, outside = (chi2_by_kind(problem, out) for out in (prediction.inside, prediction.outside))
+    size, size_outside = (raw_sizes(problem, out) for out in (prediction.inside, prediction.outside))
+    return [
+        PredictedFit(*key, count, chi2, outside[key].chi2, size[key].rms, size_outside[key].rms, size[key].unit)
+        for key, (count, chi2) in inside.items()
+    ]
+
+
+# Parts of the formal variances by their source, and empirical factors on each part.
+
+ENOUGH_SEGMENTS = 8  # segments; with as many, Student's t differs from the normal distribution by 8 % at most
+
+
+class VarianceParts(NamedTuple):
+    """Shares of the formal variances by source, and how much larger each part is in truth.
+
+    noise, prior (B,): shares of the measurement noise and of errors of nuisance parameters; errors of the initial guess
+    along unobservable directions contribute the rest. ratio (B,): empirical over formal standard deviation of the noise
+    part. weight: factor on the standard deviation of the prior part, see `Determined.inflation`.
+    """
+
+    noise: np.ndarray
+    prior: np.ndarray
+    ratio: np.ndarray
+    weight: float
+
+    @classmethod
+    def of(cls, determined: Determined, segments: Segments | None) -> VarianceParts:
+        """Variance shares and empirical factors of the estimate `determined`. segments: None if the recording is not
+        split."""
+        estimate = determined.estimate
+        variance, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
+        prior = np.clip(determined.prior_variance(), 0.0, variance - guess)
+        formal = noise_variance(estimate.problem, estimate.outcome)
+        empirical = _empirical_variance(estimate, segments, formal)
+        ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed
+        return cls(np.maximum(1.0 - (guess + prior) / variance, 0.0), prior / variance, ratio, determined.inflation)
+
+    def pooled(self, columns: np.ndarray) -> float:
+        """Root mean square of the ratio over `columns`, weighted by the noise share of each."""
+        weights = self.noise[columns]
+        total = float(weights.sum())
+        return float(np.sqrt(weights @ self.ratio[columns] ** 2 / total)) if total > 0.0 else 1.0
+
+    def factor(self, columns: np.ndarray, overall: float) -> np.ndarray:
+        """(n,) empirical factors on the formal standard deviations of a group with n `columns`.
+
+        Each part of the variance has its own factor. The noise part has the square of the larger of two ratios: the
+        pooled ratio of the group and the `overall` one, at least 1. The prior part has the square of `weight`, and the
+        part from the initial guess has 1.
+        """
+        noise_factor = max(1.0, self.pooled(columns), overall)
+        noise, prior = self.noise[columns], self.prior[columns]
+        return np.sqrt(noise_factor**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
+
+
+def _empirical_variance(estimate: Estimate, segments: Segments | None, white: np.ndarray) -> np.ndarray:
+    """(B,) variances: the larger of the scatter over segments and over feature tracks. The excess of cluster-robust
+    variances over `white` (B,) is added, for image and target regions. Returns `white` without segments and tracks."""
+    if segments is None and not estimate.problem.ties_distant_keyframes:
+        return white
+    clusters = cluster_covariances(estimate.problem, estimate.outcome)
+    spread = white if clusters.tracks is None else np.diag(clusters.tracks)
+    if segments is not None:
+        over_segments = few_factor(segments.count) ** 2 * spread_variance(estimate.outcome, segments, white)
+        spread = over_segments if clusters.tracks is None else np.maximum(spread, over_segments)
+    return spread + sum(np.maximum(np.diag(V) - white, 0.0) for V in clusters.regions)
+
+
+def few_factor(segments: int) -> float:
+    """Factor on a standard deviation from the scatter of few segments, so that 68 % of errors lie within. It is a
+    quantile of Student's t with segments - 1 degrees of freedom."""
+    return float(stdtrit(segments - 1, ndtr(1.0))) if segments < ENOUGH_SEGMENTS else 1.0

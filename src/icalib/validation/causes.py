@@ -7,23 +7,34 @@ density of the IMU is advised only if its readings show it by themselves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs
-from icalib.estimate.residual_statistics.parameter_changes import Change, changes, scatter
-from icalib.estimate.residual_statistics.segments import Segments
-from icalib.observability.cause import Cause
-from icalib.result import SensorFit
-from icalib.result.excess import FAR_BEYOND, excess, times
-from icalib.result.timeline import Timeline
+from icalib.estimate.inputs import Inputs
+from icalib.estimate.residual_statistics import Change, Segments, changes, rows_of, scatter
+from icalib.observability.determination import SIGMAS, Cause, Contradiction, contradictions
+from icalib.observability.prior_sensitivity import Relaxed, relaxed
+from icalib.optim.state import Key
+from icalib.result import CrossValidation, ParameterGroup, SensorFit
+from icalib.result.calibration import Timeline
+from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ratio, times
+from icalib.result.verdict import AUXILIARY
 from icalib.rig import ImuSensor, Rig
-from icalib.sensors import call_all_kinds
+from icalib.sensors import call_all_kinds, facet
+from icalib.sensors.imu.assess import quiet_scatter
 from icalib.sensors.sensor import TIME_OFFSET
-from icalib.validation.disturbance import Disturbance, disturbance
+from icalib.validation.guesses import (
+    absurd_values,
+    felt_size,
+    is_certain,
+    scale_causes,
+    scale_notes,
+    size_words,
+    stated_words,
+)
 
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
 # than 0.01.
@@ -228,3 +239,299 @@ def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
         if layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
             sizes[name], n = float(np.linalg.norm(c.value[n : n + 3])), n + 3
     return sizes["rotation"], sizes["translation"]
+
+
+# All possible causes of a wrong result, ranked: wrong values in the rig file, changes over the recording, other
+# misfit.
+
+IMAGE_KINDS = ("corners", "features")
+
+
+@dataclass(frozen=True)
+class AssessedEstimate:
+    """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
+    deviations; segments: of the recording, None if it is not split."""
+
+    inputs: Inputs
+    estimate: Estimate
+    groups: tuple[ParameterGroup, ...]
+    fits: Sequence[SensorFit]
+    factor: float
+    segments: Segments | None
+    timeline: Timeline
+
+    @property
+    def misfit_factor(self) -> float:
+        """Largest ratio of a sensor's residuals to its stated noise; at least 1."""
+        return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
+
+
+def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
+
+    against: values of the rig file that contradict an estimate without any of its values. Such an estimate is made only
+    if the first one fails or fits poorly. If `against` is empty, contradictions are searched here.
+
+    If it is not empty, its causes are grave, and tests that these values may distort are skipped. These are tests of
+    the target size, of changes over the recording, and of residuals of other kinds than IMAGE_KINDS.
+    """
+    inputs, estimate = assessed.inputs, assessed.estimate
+    stated, notes = _stated(assessed, against)
+    omitted = set(call_all_kinds("assess", "unreliable", inputs.rig, estimate.problem.factors))
+    fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
+    misfit = Misfit.of(fits)
+    known = stated
+    if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
+        scattering = assessed.factor > LARGE_FACTOR
+        known = [*stated, *changing(inputs, estimate, assessed.segments, misfit, scattering, assessed.timeline)]
+    both = ranked([*known, *misfit_causes(inputs, estimate, fits, explaining(known, misfit))])
+    return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
+
+
+def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+    """Causes that are wrong values in the rig file: target size, scales, those that each kind of sensor tests, other
+    values; and notes on the size."""
+    inputs, factor = assessed.inputs, assessed.factor
+    size = None if inputs.rig.assumes_motion else felt_size(assessed.estimate, factor)
+    wrong_size, notes = ((), ()) if against else size_words(inputs, size)
+    # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
+    certain, given = is_certain(size), bool(against)
+    relaxed_rig = None if given else relaxed(inputs, assessed.estimate)
+    scale = max(factor, assessed.misfit_factor)
+    against = against or contradictions(inputs, relaxed_rig, scale)
+    if certain:  # a wrong size also changes lever arms
+        against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
+    causes: list[Cause] = []
+    if size is not None:
+        gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
+        causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
+    causes += scale_causes(inputs, assessed.groups, size)
+    causes += call_all_kinds(
+        "assess", "causes", inputs, assessed.estimate, assessed.groups, factor, None if certain else relaxed_rig
+    )
+    explained = {key for cause in causes for key in cause.explains}
+    against = tuple(c for c in against if c.key not in explained)
+    causes += _contradicted(assessed, against, scale, certain or given, relaxed_rig)
+    return causes, (*notes, *scale_notes(inputs, size))
+
+
+def _contradicted(
+    assessed: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, relaxed_rig: Relaxed | None
+) -> Iterator[Cause]:
+    """A cause for each contradicted value in `against`, then for absurd values. scale: factor on formal standard
+    deviations; grave: whether all of them are grave. relaxed_rig: None if gains are unknown, which
+    then count as infinite."""
+    for c in against:
+        gain = np.inf if relaxed_rig is None else float(((c.off / (c.sigma / scale)) ** 2).max())
+        moves = relaxed_rig is not None and _moves_others(assessed, relaxed_rig, c.key)
+        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves)
+    yield from (Cause(s, 0.0, grave) for s in absurd_values(assessed.inputs, against, assessed.groups))
+
+
+def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) -> bool:
+    """Whether the stated value of the group `key` distorts the result: without it, a parameter of another group moves
+    by more than SIGMAS printed standard deviations."""
+    step, _ = relaxed_rig.step([key])
+    for g in assessed.groups:
+        if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:
+            continue
+        if (np.abs(step[relaxed_rig.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():
+            return True
+    return False
+
+
+# Misfit that is concentrated at one time.
+
+BINS, WINDOWS = 64, (3, 6, 9)  # bins of the recording, and of a window: a shock affects a few keyframes around it
+AT_ONE_TIME = 0.5  # share of the misfit in one window
+NEARLY_ALL = 0.9  # of the largest share of a window
+LARGE_WINDOW = (
+    3.0  # times the median chi^2 of a window; below it, the number of measurements may explain the difference
+)
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A window with most of the misfit. start, end: [s, joined clock]; share: of the misfit; gain: its chi^2 beyond
+    that of a usual window; sensors: those with large residuals in it."""
+
+    start: float
+    end: float
+    share: float
+    gain: float
+    sensors: tuple[str, ...]
+
+
+def disturbance(estimate: Estimate, misfit: float, misfits: Collection[str]) -> Disturbance | None:
+    """The shortest window with nearly all that any window has of the `misfit` (chi^2 beyond the degrees of freedom) of
+    the sensors `misfits`. None if that is less than half of it."""
+    seconds = estimate.outcome.state.seconds
+    edges = np.linspace(float(seconds[0]), float(seconds[-1]), BINS + 1)
+    chi2 = {s: np.histogram(t, edges, weights=x)[0] for s, (t, x) in _chi2_over_time(estimate).items() if s in misfits}
+    hits: list[Disturbance] = []
+    for width in WINDOWS if misfit > 0.0 else ():
+        beyond = {}
+        for sensor, of_bins in chi2.items():
+            usual = width * np.median(of_bins[of_bins > 0.0]) if of_bins.any() else 0.0
+            window = np.convolve(of_bins, np.ones(width), "valid")
+            beyond[sensor] = np.where(window > LARGE_WINDOW * usual, window - usual, 0.0)
+        total = np.sum([np.zeros(BINS - width + 1), *beyond.values()], axis=0)
+        k, gain = int(np.argmax(total)), float(total.max())
+        sensors = tuple(s for s, excess in beyond.items() if excess[k] > 0.1 * gain)
+        hits.append(Disturbance(float(edges[k]), float(edges[k + width]), min(gain / misfit, 1.0), gain, sensors))
+    enough = max([AT_ONE_TIME, *(NEARLY_ALL * hit.share for hit in hits)])
+    return next((hit for hit in hits if hit.share >= enough), None)
+
+
+def _chi2_over_time(estimate: Estimate) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """By sensor: times (n,) s on the joined clock and chi^2 (n,) of its residuals."""
+    outcome = estimate.outcome
+    rows = [r for key, f in outcome.problem.factors.items() for r in f.rows(outcome.residuals[key], outcome.state)]
+    chi2: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {r.sensor: [] for r in rows}
+    for r in rows:
+        chi2[r.sensor].append((r.seconds, (r.weighted.astype(np.float64) ** 2).sum(axis=1)))
+    return {
+        s: (np.concatenate([t for t, _ in pairs]), np.concatenate([c for _, c in pairs])) for s, pairs in chi2.items()
+    }
+
+
+# Causes and warnings for residuals that differ from the stated noise.
+
+LARGE_FACTOR = 3.0  # empirical factor; a warning above it
+CLEARLY = 1.5  # ratio of noise densities, from which on one is clearly larger
+BLOCKS = (3, 10, 30, 100)  # successive rows whose means are compared with those of white noise
+MAX_COLOUR = 2.5  # variance of means over that of white noise, or its inverse, that still counts as white
+CHANCE_SIGMAS = 3.0  # standard deviations that statistics may be off by chance
+N_NOISE_SEGMENTS = 8  # segments of the recording whose mean squares are compared
+MAX_VARIATION = 3.0  # mean square of a segment over that of the recording, or its inverse
+BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
+
+
+def misfit_causes(
+    inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit], explained: bool
+) -> Iterator[Cause]:
+    """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
+    explained: whether a named cause explains the misfit; then one sentence states the residuals."""
+    yield from (Cause(sentence, 0.0) for sentence in call_all_kinds("assess", "many_rejected", sensor_fits))
+    misfit, scatter = Misfit.of(sensor_fits), _scatter_over_stated(inputs)
+    noise = list(_noise_of_imu(inputs, sensor_fits, scatter))
+    yield from noise
+    if explained:
+        if misfit.fits:
+            yield Cause(f"residuals are larger than the stated noise predicts: {misfit.words}.", 0.0)
+        return
+    if not noise or any(scatter[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
+        yield from _unknown(inputs.rig, estimate, misfit)
+    for f in sensor_fits:
+        if sentence := misfit_words(inputs.rig, f, _is_noise(estimate, f)):
+            yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
+
+
+def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
+    """A sentence on residuals of one sensor that contradict the rig file; None if they do not. is_noise: whether they
+    are white and constant over the recording; only then a larger noise is advised."""
+    sensor = rig.sensors.get(f.sensor)
+    if sensor is None:
+        return None
+    assess_facet = facet(sensor.sensor_type, "assess")
+    if hasattr(assess_facet, "misfit"):
+        return assess_facet.misfit(sensor, f, is_noise)
+    if excess(f) == 1.0:
+        return None
+    advice = "state a larger one" if is_noise else "they are no white noise, so check its clock and its mount"
+    return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
+
+
+def _noise_of_imu(inputs: Inputs, sensor_fits: Sequence[SensorFit], scatter: Mapping[str, float]) -> Iterator[Cause]:
+    """Causes that are noise of the IMU, stated too small or too large. Another noise is advised only if the readings
+    show it by themselves. scatter: see `_scatter_over_stated`."""
+    imu_fits = [f for f in sensor_fits if f.kind in INERTIAL]
+    if inputs.rig.imu is None or not imu_fits:
+        return
+    small = [f for f in imu_fits if is_small(f)]
+    overstated = tuple(call_all_kinds("assess", "overstated_noise", inputs.rig, sensor_fits))
+    if any(scatter[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
+        scales = {kind: max(s, 1.0) for kind, s in scatter.items()}
+        misfit = Misfit.of(sensor_fits)
+        yield Cause(noise_words(inputs.rig.imu, scales), misfit.chi2, misfit.is_grave)
+    elif overstated:  # the trajectory then follows the IMU, and its residuals become small
+        yield from (Cause(sentence, 0.0) for sentence in overstated)
+    elif small and all(scatter[f.kind] < 1.0 / CLEARLY for f in small):
+        scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), scatter[f.kind]) for f in small}
+        yield Cause(noise_words(inputs.rig.imu, scales), 0.0)
+    elif small:
+        sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
+        yield Cause(
+            f"residuals of {inputs.rig.imu.name} are smaller than the stated noise predicts ({sizes}); standard "
+            "deviations are too large, if anything.",
+            0.0,
+        )
+
+
+def _unknown(rig: Rig, estimate: Estimate, misfit: Misfit) -> Iterator[Cause]:
+    """A sentence on residuals of the IMU that are too large without a known cause. None if another sensor's are, too,
+    and are white: a wrong noise of that sensor also enlarges those of the IMU."""
+    large = any(f.kind in INERTIAL for f in misfit.fits)
+    if large and not any(f.kind not in INERTIAL and _is_noise(estimate, f) for f in misfit.fits):
+        yield Cause(unknown_words(rig, misfit), misfit.chi2, misfit.is_grave)
+
+
+def _scatter_over_stated(inputs: Inputs) -> dict[str, float]:
+    """By kind of INERTIAL: the noise density that the readings show in quiet moments over the stated one; NaN without
+    an IMU."""
+    if inputs.imu is None or inputs.rig.imu is None or inputs.rig.assumes_motion:
+        return dict.fromkeys(INERTIAL, np.nan)
+    imu, stated = inputs.imu, inputs.rig.imu.noise
+    of_kinds = zip(INERTIAL, (imu.gyro, imu.accel), (stated.gyro, stated.accel), strict=True)
+    return {kind: quiet_scatter(imu.seconds, x) / density for kind, x, density in of_kinds}
+
+
+def _is_noise(estimate: Estimate, f: SensorFit) -> bool:
+    """Whether the residuals of `f` are white and constant over the recording."""
+    rows = rows_of(estimate.outcome, f.sensor, f.kind)
+    return rows is not None and are_noise(rows.weighted)
+
+
+def are_noise(rows: np.ndarray) -> bool:
+    """Whether residuals, rows (n, m), are white and of constant variance. The fit must have taken few of their degrees
+    of freedom. The mean of n white numbers has a variance n times smaller."""
+    n, square = len(rows), float(np.vdot(rows, rows))  # `vdot` needs no copy of many rows
+    if n < 2 * N_NOISE_SEGMENTS or square == 0.0:
+        return False
+    white = True
+    for length in (b for b in BLOCKS if n >= N_NOISE_SEGMENTS * b):
+        means = rows[: n // length * length].reshape(n // length, length, -1).mean(axis=1)
+        colour = length * float((means**2).mean()) / (square / rows.size)
+        allowed = MAX_COLOUR + CHANCE_SIGMAS * np.sqrt(2.0 / means.size)
+        white &= 1.0 / allowed < colour < allowed
+    sizes = [
+        float(np.vdot(segment, segment)) / segment.size / (square / rows.size)
+        for segment in np.array_split(rows, N_NOISE_SEGMENTS)
+    ]
+    allowed = np.log(MAX_VARIATION) + CHANCE_SIGMAS * np.sqrt(2.0 * N_NOISE_SEGMENTS / rows.size)
+    return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)
+
+
+def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidation | None) -> Iterator[str]:
+    """Warnings on the scatter of estimates from segments. factors (n,): empirical factors of the sensors' parameters;
+    split: whether the recording was cut into segments; validation: result of the cross-validation."""
+    if len(factors) and factors.max() > LARGE_FACTOR:
+        yield (
+            f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "
+            "standard deviations are inflated accordingly."
+        )
+    if (
+        validation is not None
+        and len(factors)
+        and validation.optimistic
+        and validation.factor > BEYOND_FACTOR * factors.max()
+    ):
+        yield (
+            f"one half of the recording predicts the other {validation.factor:.1f}x worse than predicted, and the "
+            f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small."
+        )
+    if not split:
+        yield (
+            "the recording is too short for segments (or segments are off): standard deviations are formal and too "
+            "small, as they include white noise only. Record longer."
+        )

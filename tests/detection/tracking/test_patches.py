@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.detection.tracking.tracker import RADIUS, align, cut_templates
+from icalib.detection.tracker import RADIUS, align, cut_templates
 
 SIZE = 96
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.sensors.camera.read.robot_parts import stay_in_place
+from icalib.sensors.camera.read.image_tracks import stay_in_place
 
 IMAGES = 12
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from icalib.detection.tracking.tracker import MOST_VIEWS, Observations, Tracker
+from icalib.detection.tracker import MOST_VIEWS, Observations, Tracker
 
 from .conftest import SIZE, Turning
 

@@ -17,10 +17,8 @@ from scipy.spatial.transform import Rotation
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
-from icalib.motion.sweep import EstimatedMotion
-from icalib.optim.arrowhead import Piece, in_parallel, make_pieces, solve
-from icalib.optim.calib_block import NO_DIRECTIONS
-from icalib.optim.prior_factor import Prior
+from icalib.motion.poses import EstimatedMotion
+from icalib.optim.arrowhead import NO_DIRECTIONS, Piece, Prior, in_parallel, make_pieces, solve
 from icalib.optim.state import Layout, State, make_layout
 from icalib.rig import ImuNoise
 from icalib.sensors.imu.residual import ImuFactor

@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.motion.imu_data import ImuData
-from icalib.motion.stamp_intervals import MAX_INTERVAL_S, StampIntervals, choose_intervals
+from icalib.motion.imu_data import MAX_INTERVAL_S, ImuData, StampIntervals, choose_intervals
 from icalib.rig import ImuNoise
-from icalib.sensors.wheels.integrals import integrated
-from icalib.sensors.wheels.quadrature import PANEL_S, quadrature
+from icalib.sensors.wheels.residual import PANEL_S, integrated, quadrature
 
 
 @pytest.fixture(scope="module")

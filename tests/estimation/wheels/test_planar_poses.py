@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from icalib.motion.stamp_intervals import StampIntervals
+from icalib.motion.imu_data import StampIntervals
 from icalib.optim.arrowhead import make_pieces
-from icalib.sensors.wheels.planar_poses import RelativePoses, preintegrated
+from icalib.sensors.wheels.ground_factor import RelativePoses, preintegrated
 from icalib.sensors.wheels.residual import RelativePoseFactor, WheelNoise, drive_of, wheel_intervals
 
 RNG = np.random.default_rng(3)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from icalib.motion.pose_rows import Extrinsics
-from icalib.sensors.wheels.propagation_noise import propagation_noise
+from icalib.motion.factor import Extrinsics
+from icalib.sensors.wheels.residual import propagation_noise
 
 GYRO, ACCEL = 3e-3, 0.4  # rad/sqrt(s), m/s/sqrt(s): so large that both count
 AWAY = np.array([[0.02, 0.005], [0.0, 0.015]])

@@ -18,7 +18,7 @@ import numpy as np
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.geometry.vectors import cross
+from icalib.geometry.small import cross
 
 _GRID = (48, 32)  # number of pixels across and down, including the image borders
 _MAX_STEPS = 200  # ten are enough, unless the best fit is outside the model's range

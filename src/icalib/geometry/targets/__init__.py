@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from icalib.geometry.targets.aprilgrid import AprilGrid
 from icalib.geometry.targets.base import Target
-from icalib.geometry.targets.charuco import Charuco
-from icalib.geometry.targets.checkerboard import Checkerboard
-from icalib.geometry.targets.circles import Circles
-from icalib.geometry.targets.markers import Markers, Tag
+from icalib.geometry.targets.boards import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag
 from icalib.geometry.targets.scene import NoTarget, Scene
 
 __all__ = [

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from icalib.base.extras import load_cv2
-from icalib.base.suggestion import suggestion
+from icalib.base.yaml_nodes import suggestion
 from icalib.errors import RecordingError, RigError
 
 # name -> (bits along a side without the border, number of ids); aruco_original is the family of the ArUco library.

@@ -14,8 +14,7 @@ import numpy as np
 
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets.base import Target
-from icalib.geometry.targets.checkerboard import Checkerboard
-from icalib.geometry.targets.circles import Circles
+from icalib.geometry.targets.boards import Checkerboard, Circles
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,16 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.sensor_pose import SensorPose, chain_width, fill_chain
-from icalib.optim.robust_weights import (
+from icalib.optim.rows import (
     add_common_error,
+    add_gradients,
+    add_gram,
     correct_curvature,
     marginalise_gradients,
     marginalise_shared,
     robust_weights,
     weight,
 )
-from icalib.optim.rows import add_gradients, add_gram
 
 
 class ViewCorners(NamedTuple):

@@ -19,15 +19,17 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import KDTree
 
 from icalib.data.measurements import CornerStream
 from icalib.errors import EstimationError
-from icalib.model.statistics import Fit
-from icalib.optim.medians import median_variance
+from icalib.model.sensor_model import Fit
+from icalib.optim.rows import grouped_quantiles, largest_normal, median_variance
 from icalib.optim.state import State
 from icalib.rig import Camera, Settings
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.sensors.camera.corner_misfit import LensMisfit, lens_misfit
 
 INITIAL_CORNER_NOISE_PX = 0.5  # per axis, in the first pass: typical residual with a rough lens
 MIN_COMMON_ERROR_PX, MAX_COMMON_ERROR_PX = 1e-3, 5.0  # limits of tau: for finite weights, and against divergence
@@ -236,3 +238,159 @@ def _fit_blur(square: np.ndarray, speed: np.ndarray) -> tuple[float, float]:
     if b <= 0.0 or a <= 0.0:
         return float(np.sqrt(median_variance(square))), 0.0
     return float(np.sqrt(a)), float(np.sqrt(b))
+
+
+# Rejects corners with large residuals, unless their neighbours in the image plane have similar ones.
+#
+# Misfit of the lens model causes large residuals near the border of the image. They are similar for neighbouring
+# corners of all images, and decrease towards the middle. A gross outlier has no similar neighbours. So a corner with a
+# large residual is only suspect. It is kept if a chain of neighbours with similar residuals leads from it to a corner
+# that is not suspect.
+
+N_NEIGHBOURS = 12  # nearest corners; with 24, small outliers near the border have similar neighbours by chance
+# Corners without suspicion, among which neighbours are searched: one per 4 x 4 px of an image of 752 x 480 px. With
+# fewer, neighbours are farther away; with more, the search needs more time and memory.
+MAX_UNSUSPECT_CORNERS = 20_000
+CORNERS_PER_TAG = 4  # corners of a tag in one image are no neighbours: a misidentified tag displaces all alike
+SIMILAR_RATIO = 0.7  # largest difference of similar residuals over the suspect's; at 1, zero would be similar
+
+
+def inliers(factor: CornerFactor, out: CornerOutput, settings: Settings) -> np.ndarray:
+    """(N,) bool: corners that are not rejected. Corners outside the range of the lens model are rejected, too.
+
+    A corner is suspect if its residual is longer than `outlier_min_px`, and longer than mean plus `outlier_std`
+    standard deviations of normal errors. Lengths of normal errors have a Rayleigh distribution. Its scale follows from
+    the median length of the image or of all images, whichever is larger. A suspect corner is rejected if it is
+    `isolated`, or if the loss is `none`. All corners are kept if `outlier_std` is 0.
+    """
+    if settings.outlier_std <= 0.0:
+        return np.ones(len(out.root), dtype=bool)
+    used = np.flatnonzero((out.root > 0.0) | ~factor.keep)  # rejected corners are tested again: they may fit now
+    kept = np.zeros(len(out.root), dtype=bool)
+    kept[used] = ~rejected(factor, used, out.residual[used], settings)
+    return kept
+
+
+def rejected(factor: CornerFactor, rows: np.ndarray, residual: np.ndarray, settings: Settings) -> np.ndarray:
+    """(n,) bool: outliers among the corners `rows` (n,) of the stream, with residuals (n, 2) [px]; see `inliers`."""
+    if settings.outlier_std <= 0.0:
+        return np.zeros(len(rows), dtype=bool)
+    # Double precision: in gaps of the IMU, poses may project points to 1e20 px, and squares would overflow.
+    residual = residual.astype(np.float64)
+    stream, size = factor.stream, np.linalg.norm(residual, axis=1)
+    image = stream.image[rows]
+    usual = grouped_quantiles(size, image, len(stream.stamps_ns), 0.5)
+    if len(size):
+        usual = np.maximum(usual, np.median(size))
+    limit = np.maximum(largest_normal(settings.outlier_std, 0.5) * usual, settings.outlier_min_px)
+    suspect = size > limit[image]
+    if settings.loss == "none" or not suspect.any():  # without robust loss, an outlier has unbounded influence
+        return suspect
+    some, number = _with_neighbours(suspect), factor.bodies.target.tag_number
+    tag = image[some] * (1 + number.max(initial=0)) + number[stream.point[rows[some]]]
+    suspect[some] = isolated(stream.uv[rows[some]], residual[some], suspect[some], tag)
+    return suspect
+
+
+def _with_neighbours(suspect: np.ndarray) -> np.ndarray:
+    """(n,) sorted indices of all corners that are `suspect` (N,) bool, and of every k-th other corner, at most
+    MAX_UNSUSPECT_CORNERS."""
+    others = np.flatnonzero(~suspect)
+    return np.union1d(np.flatnonzero(suspect), others[:: 1 + len(others) // MAX_UNSUSPECT_CORNERS])
+
+
+def isolated(uv: np.ndarray, residual: np.ndarray, suspect: np.ndarray, tag: np.ndarray) -> np.ndarray:
+    """(N,) bool: `suspect` (N,) corners without a chain of similar neighbours to a corner that is not suspect.
+
+    uv, residual (N, 2) [px]: corners of all images together. tag (N,) int: a number for each tag in each image; corners
+    with the same number share errors, and are no neighbours. Neighbours are the nearest corners in the image plane.
+    """
+    suspects = np.flatnonzero(suspect)
+    if not len(suspects):
+        return np.zeros(len(uv), dtype=bool)
+    near = KDTree(uv).query(uv[suspects], min(N_NEIGHBOURS + CORNERS_PER_TAG, len(uv)))[1].reshape(len(suspects), -1)
+    difference = np.linalg.norm(residual[near] - residual[suspects, None], axis=2)
+    similar = difference < SIMILAR_RATIO * np.linalg.norm(residual[suspects], axis=1)[:, None]
+    similar &= tag[near] != tag[suspects, None]
+    # A graph with a vertex for each suspect corner; vertex 0 stands for all corners that are not suspect.
+    vertex = np.zeros(len(uv), dtype=np.int64)
+    vertex[suspects] = 1 + np.arange(len(suspects))
+    row, column = np.nonzero(similar)
+    ends = vertex[suspects][row], vertex[near[row, column]]
+    graph = coo_array((np.ones(len(row)), ends), shape=(len(suspects) + 1, len(suspects) + 1))
+    component = connected_components(graph, directed=False)[1]
+    out = np.zeros(len(uv), dtype=bool)
+    out[suspects[component[1:] != component[0]]] = True
+    return out
+
+
+# Misfit of the lens model: the part of the corner residuals that is a function of the image position alone.
+#
+# The residuals of a camera are averaged over cells of the image, in groups of consecutive images. Without misfit the
+# means of two groups are independent, with mean zero. So the mean product over pairs of different groups estimates the
+# squared misfit without bias (a U-statistic; Hoeffding 1948). Without misfit its variance is twice the sum of the
+# squared products over ordered pairs. That holds even if cells of one group share an error, such as one of the pose.
+
+# Columns and rows of cells in the bounding box of all corners. Smaller cells resolve finer misfit with more noise.
+MISFIT_CELLS = (12, 8)
+MAX_IMAGE_GROUPS = 200  # errors correlate between successive images, so groups must be long against the correlation
+MIN_GROUPS_IN_CELL = 3  # groups with corners in a cell, below which the cell is left out
+SIGNIFICANT_STD = 5.0  # standard deviations of the statistic under noise alone; a smaller misfit counts as zero
+
+
+@dataclass(frozen=True)
+class LensMisfit:
+    """Misfit of one camera's lens model.
+
+    rms [px]: RMS misfit per image axis over all corners, 0 if it is not significant. field (N, 2) [px]: mean residual,
+    predicted - measured, in the cell of each corner; 0 in cells with too few groups.
+    """
+
+    rms: float
+    field: np.ndarray
+
+
+def lens_misfit(stream: CornerStream, residual: np.ndarray, used: np.ndarray) -> LensMisfit:
+    """The misfit of one camera's lens model.
+
+    residual (N, 2) [px]: predicted - measured; used (N,) bool: corners in use. The misfit is zero if it is not
+    significant, or no corner is in use.
+    """
+    nothing = LensMisfit(0.0, np.zeros((len(used), 2), np.float32))
+    if not used.any():
+        return nothing
+    cell, n, images = _cells(stream.uv, used), MISFIT_CELLS[0] * MISFIT_CELLS[1], len(stream.stamps_ns)
+    group_of_image = np.arange(images) * min(images, MAX_IMAGE_GROUPS) // images
+    n_groups = int(group_of_image[-1]) + 1
+    key = (group_of_image * n).astype(np.int32)[stream.image[used]] + cell[used]
+    count = np.bincount(key, minlength=n_groups * n).reshape(n_groups, n)
+    means = np.stack([np.bincount(key, residual[used, k], n_groups * n) for k in range(2)], axis=1)
+    means = means.reshape(n_groups, n, 2) / np.maximum(count, 1)[:, :, None]
+    groups = (count > 0).sum(axis=0)
+    enough = groups >= MIN_GROUPS_IN_CELL
+    share = np.where(enough, count.sum(axis=0), 0.0)
+    # products[a, b]: product of the means of groups a and b, summed over cells with their numbers of corners as
+    # weights, over the number of pairs. Without misfit, off-diagonal entries have mean zero. The diagonal, which holds
+    # the noise, is dropped.
+    root = np.sqrt(share / max(share.sum(), 1.0) / np.maximum(groups * (groups - 1.0), 1.0))
+    scaled = root[:, None] * means
+    products = np.einsum("acx,bcx->ab", scaled, scaled, optimize=True)
+    np.fill_diagonal(products, 0.0)
+    square = float(products.sum())  # of both components together
+    if not square > SIGNIFICANT_STD * np.sqrt(2.0 * float((products**2).sum())):
+        return nothing
+    mean = np.where(enough[:, None], means.sum(axis=0) / np.maximum(groups, 1)[:, None], 0.0)
+    return LensMisfit(float(np.sqrt(0.5 * square)), mean.astype(np.float32)[cell])
+
+
+def _cells(uv: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """(N,) int: cell of each corner uv (N, 2) px, in a grid over the bounding box of the `used` corners."""
+    column, row = (_strips(uv[:, k], used, MISFIT_CELLS[k]) for k in range(2))
+    return row * np.int16(MISFIT_CELLS[0]) + column
+
+
+def _strips(x: np.ndarray, used: np.ndarray, count: int) -> np.ndarray:
+    """(N,) int16 from 0 to `count` - 1: number of the interval of x (N,), when `count` equal ones span the `used` x."""
+    used_x = x[used]
+    low, size = used_x.min(), np.ptp(used_x) + 1e-9
+    return np.clip((x - low) / size * count, 0, count - 1).astype(np.int16)

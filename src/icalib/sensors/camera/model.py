@@ -4,23 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
 from icalib.data.measurements import CornerStream, Measurements
+from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
+from icalib.geometry.targets import Target
 from icalib.model.bodies import Bodies
-from icalib.model.sensor_model import Clusters, Pass, SensorModel, model_of
-from icalib.model.statistics import PassEnd
+from icalib.model.sensor_model import Clusters, Pass, PassEnd, SensorModel, model_of
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
-from icalib.motion.time_offsets import instants
+from icalib.motion.poses import MERGED_WITHIN_S, instants
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.state import Layout, State
 from icalib.rig import LENS, Camera, ParameterSpec, Rig, Settings
-from icalib.sensors.camera.bloom import with_bloom
-from icalib.sensors.camera.circle_centres import with_circle_centres
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
+from icalib.sensors.camera.corner_bias import with_bent_edges, with_bloom, with_circle_centres
+from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerFactor, CornerNoise, CornerOutput
 from icalib.sensors.camera.corner_noise import (
     INITIAL_COMMON_ERROR_PX,
     MAX_INITIAL_JITTER_S,
@@ -31,20 +31,15 @@ from icalib.sensors.camera.corner_noise import (
     from_middle,
     image_flow,
     image_speed,
+    inliers,
     scale_shift,
     with_jitter,
 )
-from icalib.sensors.camera.corner_outliers import inliers
-from icalib.sensors.camera.corner_statistics import DELAY, SHIFT
-from icalib.sensors.camera.edge_curvature import with_bent_edges
-from icalib.sensors.camera.features.error_clusters import error_clusters
-from icalib.sensors.camera.features.patch_curvature import with_curved_patches
-from icalib.sensors.camera.features.residual import FeatureFactor
-from icalib.sensors.camera.features.surfaces import Surfaces
-from icalib.sensors.camera.features.track_selection import TrackSelection, next_selections, observed_at_keyframes
-from icalib.sensors.camera.image_pairs import not_simultaneous
-from icalib.sensors.camera.image_times import are_used, keyframes_of, on_common_images
+from icalib.sensors.camera.image_times import are_used, keyframes_of, not_simultaneous, on_common_images
 from icalib.sensors.camera.spec import BLOOM
+from icalib.sensors.camera.track_factor import FeatureFactor
+from icalib.sensors.camera.track_selection import TrackSelection, error_clusters, next_selections, observed_at_keyframes
+from icalib.sensors.camera.track_surfaces import Surfaces, with_curved_patches
 from icalib.sensors.sensor import MOUNTED, TIME_OFFSET
 
 NO_BLOOM = np.zeros((0, 2), dtype=np.float32)  # directions without bloom; single precision is enough for directions
@@ -301,3 +296,156 @@ def _noise_is_estimated(
 
 
 MODEL = CameraSensorModel()
+
+
+# Selects the bodies of a target whose poses are estimated: those that shared images connect.
+
+MIN_SHARED_IMAGES = 3  # that show both of two bodies, for their relative pose to count as observed
+MAX_NAMED_BODIES = 8  # in a sentence
+
+
+def choose_bodies(target: Target, recordings: Sequence[Measurements], bent: bool, rig: Rig | None = None) -> Bodies:
+    """The bodies in use: the one with most corners, which is the reference, and all that images connect to it.
+
+    An image connects all bodies that it shows; connections through other bodies count. In a `rig` of cameras alone,
+    simultaneous images of different cameras connect bodies, too. bent: whether shapes of bodies are estimated.
+
+    Raises EstimationError if no corner was seen, or if a camera saw only bodies without connection to the reference.
+    """
+    streams = [c for m in recordings for c in m.cameras]
+    n = len(target.bodies)
+    if n == 0:
+        return Bodies(target, ())
+    count = sum((np.bincount(target.body[s.point], minlength=n) for s in streams), np.zeros(n, dtype=np.int64))
+    if not count.any():
+        raise EstimationError("no camera saw the target; check the target in the rig file.")
+    together = _in_images(target.body, recordings, n)
+    if rig is not None and rig.cameras_alone:
+        together += sum(_at_once(target.body, rig, m, n) for m in recordings)
+    reached = _tied_to(int(np.argmax(count)), together)
+    lost = tuple(int(k) for k in np.flatnonzero(count) if k not in reached)
+    _check_cameras(target, streams, reached, rig is not None and rig.imu is not None)
+    return Bodies(target, reached, lost, bent, sized=target.size_sigma > 0.0)
+
+
+def tied_by_images(bodies: Bodies, recordings: Sequence[Measurements]) -> list[tuple[int, ...]]:
+    """The bodies in use, grouped by connection through images. The first group has the reference."""
+    together = _in_images(bodies.target.body, recordings, len(bodies.target.bodies))
+    left, groups = list(bodies.used), []
+    while left:
+        groups.append(_tied_to(left[0], together))
+        left = [k for k in left if k not in groups[-1]]
+    return groups
+
+
+def _tied_to(first: int, together: np.ndarray) -> tuple[int, ...]:
+    """Indices of the body `first`, then in increasing order of all bodies connected to it.
+
+    together (n, n): number of images that show both bodies of a pair."""
+    reached = [first]
+    for k in reached:
+        reached += [int(j) for j in np.flatnonzero(together[k] >= MIN_SHARED_IMAGES) if j not in reached]
+    return (first, *sorted(reached[1:]))
+
+
+def _in_images(body: np.ndarray, recordings: Sequence[Measurements], n: int) -> np.ndarray:
+    """(n, n) number of images, of all recordings and cameras, that show both bodies of a pair.
+
+    body (n_points,): index of the body of each point."""
+    return sum((_together(body, c, n) for m in recordings for c in m.cameras), np.zeros((n, n), dtype=np.int64))
+
+
+def _check_cameras(target: Target, streams: Sequence[CornerStream], used: Sequence[int], imu: bool) -> None:
+    """Raises EstimationError naming a camera that saw bodies, but none of those in use.
+
+    used: indices of these; imu: whether the rig has an IMU."""
+    for name in dict.fromkeys(s.name for s in streams):
+        bodies = np.unique(np.concatenate([target.body[s.point] for s in streams if s.name == name]))
+        if len(bodies) and not np.isin(bodies, used).any():
+            how = (
+                "calibrate the cameras without the IMU, whose images may be synchronised"
+                if imu
+                else ("take images of all cameras at the same instants")
+            )
+            names, first = _listed([target.bodies[k] for k in bodies]), target.bodies[used[0]]
+            raise EstimationError(
+                f"{name} sees {names} only, and fewer than {MIN_SHARED_IMAGES} images determine its pose relative "
+                f"to {first}; show both in the same images, or {how}."
+            )
+
+
+def _together(body: np.ndarray, stream: CornerStream, n: int) -> np.ndarray:
+    """(n, n) number of images of `stream` that show both bodies of a pair."""
+    pairs = np.unique(stream.image * n + body[stream.point])
+    image, which = np.divmod(pairs, n)
+    shows = np.zeros((len(stream.stamps_ns), n), dtype=np.float32)
+    shows[image, which] = 1.0
+    return np.rint(shows.T @ shows).astype(np.int64)
+
+
+def _at_once(body: np.ndarray, rig: Rig, recording: Measurements, n: int) -> np.ndarray:
+    """(n, n) number of instants at which one camera sees body i while another camera sees body j."""
+    count, shows = np.zeros((n, n), dtype=np.int64), []
+    for stream in recording.cameras:
+        rows = np.zeros((len(stream.stamps_ns), n), dtype=np.int64)
+        rows[stream.image, body[stream.point]] = 1
+        shows.append(rows)
+    times = camera_times(rig, recording, recording.origin_ns)
+    for a, b in permutations(range(len(shows)), 2):
+        i, j = taken_at_once(times[a], times[b])
+        count += shows[a][i].T @ shows[b][j]
+    return count
+
+
+def camera_times(rig: Rig, recording: Measurements, origin_ns: int) -> list[np.ndarray]:
+    """For each camera (M,) instants of its images [s since `origin_ns`], by the time offset of the rig file or zero."""
+    given = [c.time_offset.value for c in rig.cameras]
+    offsets_ns = [0 if v is None else round(float(v[0]) * 1e9) for v in given]
+    pairs = zip(recording.cameras, offsets_ns, strict=True)
+    return [(s.stamps_ns - origin_ns + offset_ns) * 1e-9 for s, offset_ns in pairs]
+
+
+def taken_at_once(ta: np.ndarray, tb: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices i and j (k,) of images at ta (n,) and tb (m,) s that are at most `MERGED_WITHIN_S` apart."""
+    j = np.clip(np.searchsorted(tb, ta - MERGED_WITHIN_S), 0, len(tb) - 1)
+    i = np.flatnonzero(np.abs(tb[j] - ta) <= MERGED_WITHIN_S)
+    return i, j[i]
+
+
+def restrict(bodies: Bodies, recording: Measurements) -> Measurements:
+    """The recording without corners of bodies that are not in use; corners of each image are sorted by body."""
+    if len(bodies.target.bodies) == 1:
+        return recording
+    return recording.with_streams(*(_restricted(bodies, c) for c in recording.cameras))
+
+
+def without_bodies(target: Target, names: Sequence[str], recording: Measurements) -> Measurements:
+    """The recording without corners of the bodies called `names`, with a note on them."""
+    kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
+    cameras = [_restricted(Bodies(target, kept), c) for c in recording.cameras]
+    note = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
+    return replace(recording.with_streams(*cameras), notes=(*recording.notes, note))
+
+
+def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
+    """The corners of bodies in use, sorted by body in each image. Images without such corners are left out."""
+    body = bodies.target.body[stream.point]
+    order = np.lexsort((body, stream.image))
+    order = order[np.isin(body[order], bodies.used)]
+    count = np.bincount(stream.image[order], minlength=len(stream.stamps_ns))
+    return stream.of_rows(order, stream.stamps_ns[count > 0], count[count > 0])
+
+
+def words_on_left_out(bodies: Bodies) -> str:
+    """A sentence on the bodies that were seen but are not used; empty if there are none."""
+    if not bodies.left_out:
+        return ""
+    names = [bodies.target.bodies[k] for k in bodies.left_out]
+    return (
+        f"ignored, because fewer than {MIN_SHARED_IMAGES} images show them together with the others: {_listed(names)}."
+    )
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MAX_NAMED_BODIES} more" if len(names) > MAX_NAMED_BODIES else ""
+    return f"{', '.join(names[:MAX_NAMED_BODIES])}{more}"

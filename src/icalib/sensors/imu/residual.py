@@ -19,10 +19,9 @@ from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
 from icalib.motion.integration import Increment, bias_of, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
-from icalib.motion.sweep import gravity_of
+from icalib.motion.poses import gravity_of
 from icalib.optim import memory
-from icalib.optim.arrowhead import Piece, in_parallel
-from icalib.optim.prior_factor import accumulate_bias_prior
+from icalib.optim.arrowhead import Piece, accumulate_bias_prior, in_parallel
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
 from icalib.optim.state import KEYFRAME_DIM, State
 

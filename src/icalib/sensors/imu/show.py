@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.report.motion_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
-from icalib.report.plot import Figure, thin
-from icalib.report.residual_views import ResidualCurve
-from icalib.report.sections import Section, plot_place
+from icalib.report.figures import Figure, ResidualCurve, thin
+from icalib.report.page import Section, plot_place
+from icalib.report.rig_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
 from icalib.result import Calibration
-from icalib.sensors.imu.record import ImuResiduals
+from icalib.sensors.imu.stream import ImuResiduals
 
 LEGEND = "the axes of an IMU are those of its gyroscope"
 BLOCKS = ("rotation", "velocity", "position", "gyro walk", "accel walk")  # titles of three columns each

@@ -9,10 +9,16 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.sensors.fields import TABLE, axes_or_none, choice_or, layout_to_plain, table_layout
-from icalib.sensors.parameter import Parameter
-from icalib.sensors.parameter_fields import parameter_to_plain, vector_parameter
-from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.fields import (
+    TABLE,
+    axes_or_none,
+    choice_or,
+    layout_to_plain,
+    parameter_to_plain,
+    table_layout,
+    vector_parameter,
+)
+from icalib.sensors.parameter import Parameter, ParameterSpec
 from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sampling, Sensor, TableLayout
 
 

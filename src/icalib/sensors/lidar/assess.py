@@ -11,20 +11,19 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes import count_directions, normal_shares
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.assembly import motion_of
-from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.inputs import Inputs, origin_difference
+from icalib.estimate.problem import motion_of
 from icalib.geometry.planes import plane_of
 from icalib.motion.factor import of_type
-from icalib.motion.keyframe_placement import usable
-from icalib.motion.time_offsets import instants
+from icalib.motion.poses import instants, usable
 from icalib.optim.state import State
 from icalib.result import Plane, SensorFit
-from icalib.result.excess import excess, times
-from icalib.result.timeline import Timeline
+from icalib.result.calibration import Timeline
+from icalib.result.quantities import excess, times
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.binning import LidarNoise, in_world
-from icalib.sensors.lidar.record import LidarResiduals
 from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
 MIN_FITTED_POINTS = 4  # a plane has 3 unknowns; fewer points leave no residual

@@ -28,11 +28,9 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
-from icalib.motion.keyframe_placement import usable
-from icalib.motion.sweep import EstimatedMotion, sweep
-from icalib.motion.time_offsets import instants
+from icalib.motion.poses import EstimatedMotion, instants, sweep, usable
 from icalib.optim.arrowhead import in_parallel
-from icalib.optim.robust_weights import LOSSES, weight
+from icalib.optim.rows import LOSSES, weight
 from icalib.rig import Loss
 
 BIN_S = 3e-3  # duration of a bin; its points share the pose perturbation of its centre

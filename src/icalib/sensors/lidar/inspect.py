@@ -12,8 +12,7 @@ from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.point_clouds import point_clouds, timing_fields
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import Sensor, TimeUnit
-from icalib.tools.inspection.facts import Finding, Inspection, SensorSource
-from icalib.tools.inspection.kinds import KindInspector, independent, moving
+from icalib.tools.inspection.facts import Finding, Inspection, KindInspector, SensorSource, independent, moving
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.data.measurements import LidarStream
-from icalib.model.sensor_model import Pass, SensorModel
-from icalib.model.statistics import ResidualStatistics
-from icalib.motion.plane_association import PlaneAssociation
-from icalib.motion.point_planes import thinned
+from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel
+from icalib.motion.point_planes import PlaneAssociation, thinned
 from icalib.rig import Lidar, Settings
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor

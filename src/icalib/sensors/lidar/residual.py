@@ -19,13 +19,11 @@ import numpy as np
 from icalib.data.measurements import LidarStream
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import assign_keyframes
+from icalib.motion.poses import EstimatedMotion as ImuMotion
+from icalib.motion.poses import assign_keyframes, instants, offset_at, slices_by_clock
 from icalib.motion.sensor_pose import Kinematics, SensorPose
-from icalib.motion.sweep import EstimatedMotion as ImuMotion
-from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece, in_parallel
-from icalib.optim.planes import Planes
-from icalib.optim.state import Key, Layout, State
+from icalib.optim.state import Key, Layout, Planes, State
 from icalib.rig import Scheme
 from icalib.sensors.lidar import kernels
 from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments

@@ -7,13 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from icalib.report.plot import VIEW, Figure, axis, dots, figure, line, numbers, path_3d, thin
-from icalib.report.residual_views import ResidualCloud, ResidualCurve
-from icalib.report.rig_shapes import CIRCLE, PEN_UP
-from icalib.report.sections import Section, plot_place
-from icalib.report.tables import Html, element, html
+from icalib.report.figures import (
+    VIEW,
+    Figure,
+    ResidualCloud,
+    ResidualCurve,
+    axis,
+    dots,
+    figure,
+    line,
+    numbers,
+    path_3d,
+    thin,
+)
+from icalib.report.page import Html, Section, element, html, plot_place
+from icalib.report.rig_figures import CIRCLE, PEN_UP
 from icalib.result import Calibration, Plane
-from icalib.sensors.lidar.record import LidarResiduals
+from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_DOTS = 2500  # points in a figure of residuals: more hide one another
 MAX_MAP_POINTS = 20_000  # points in a 3D map of the planes: keeps the page small

@@ -15,12 +15,18 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
 from icalib.sensors.lidar.spec import Lidar
 from icalib.tools.simulation.output import BagWriter
-from icalib.tools.simulation.scenario.fields import at_least, interval, mounted_fields
-from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
-from icalib.tools.simulation.scenario.robot import Drive
-from icalib.tools.simulation.scenario.room import Room, RoomSurfaces, nearest
-from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
-from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
+from icalib.tools.simulation.room import Room, RoomSurfaces, nearest
+from icalib.tools.simulation.scenario import (
+    BagEvent,
+    BagTopic,
+    Report,
+    SimScene,
+    SimSensor,
+    at_least,
+    interval,
+    mounted_fields,
+)
+from icalib.tools.simulation.trajectory import LEAD_S, Drive, TrueTrajectory, stamped
 
 _FIRING_S = 2.304e-6  # between the firings of two lasers of a column (Velodyne VLP-16 manual)
 _CLOUD_MESSAGE = "sensor_msgs/msg/PointCloud2"

@@ -8,17 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs, with_association
-from icalib.estimate.residual_statistics.score_test import LeftOut, score_test
-from icalib.estimate.residual_statistics.segments import Segments
+from icalib.estimate.inputs import Inputs, with_association
+from icalib.estimate.residual_statistics import Segments
+from icalib.estimate.score_test import LeftOut, score_test
 from icalib.motion.factor import Whitened, output_at, pairs_of
-from icalib.observability.contradictions import SIGMAS
-from icalib.optim.arrowhead import NotDefiniteError, solve
-from icalib.optim.calib_block import UNOBSERVABLE_BELOW, essential_information
+from icalib.observability.determination import SIGMAS
+from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
-from icalib.result.excess import excess, times
-from icalib.result.row_records import lag_one_correlation
-from icalib.result.timeline import Timeline
+from icalib.result.calibration import Timeline, lag_one_correlation
+from icalib.result.quantities import excess, times
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.pose.residual import POSE_KINDS, PoseFactor, PoseNoise, RelativePosesFactor
 

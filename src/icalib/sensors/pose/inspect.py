@@ -12,8 +12,7 @@ from icalib.errors import RecordingError
 from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import FramePair, Inspection, SensorSource
-from icalib.tools.inspection.kinds import Key, KindInspector, inertial
+from icalib.tools.inspection.facts import FramePair, Inspection, Key, KindInspector, SensorSource, inertial
 
 
 class PoseInspector(KindInspector):

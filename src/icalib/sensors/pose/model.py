@@ -7,11 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from icalib.data.measurements import PoseStream
-from icalib.model.frames import frame_entries
-from icalib.model.sensor_model import Pass, SensorModel
-from icalib.model.statistics import ResidualStatistics
-from icalib.motion.keyframe_placement import spaced
-from icalib.motion.time_offsets import instants
+from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel, frame_entries
+from icalib.motion.poses import instants, spaced
 from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor

@@ -20,16 +20,24 @@ import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.geometry import so3
-from icalib.model.frames import FRAME, frame_of
-from icalib.motion.factor import FactorKey, RowFactor, Whitened
-from icalib.motion.imu_data import ImuData
-from icalib.motion.keyframe_placement import MERGED_WITHIN_S
-from icalib.motion.pose_rows import Frame, PoseResiduals, absolute_residuals, relative_residuals
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks, rows_by_recording
+from icalib.model.sensor_model import FRAME, frame_of
+from icalib.motion.factor import (
+    FactorKey,
+    Frame,
+    Into,
+    PoseResiduals,
+    RobustNoise,
+    RowFactor,
+    Whitened,
+    absolute_residuals,
+    add_rows,
+    in_chunks,
+    relative_residuals,
+    rows_by_recording,
+)
+from icalib.motion.imu_data import ImuData, StampIntervals, choose_intervals
+from icalib.motion.poses import MERGED_WITHIN_S, EstimatedMotion, instants, offset_at, slices_by_clock
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
-from icalib.motion.stamp_intervals import StampIntervals, choose_intervals
-from icalib.motion.sweep import EstimatedMotion
-from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State

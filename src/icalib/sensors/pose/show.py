@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.report.sections import Section, row_sections
+from icalib.report.page import Section, row_sections
 from icalib.result import Calibration
 
 _SECTION_WORDS = (

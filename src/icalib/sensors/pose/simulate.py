@@ -12,11 +12,19 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import PoseStream
 from icalib.sensors.pose.spec import PoseSensor
+from icalib.tools.simulation.motion import rotation_from_vector
 from icalib.tools.simulation.output import BagWriter, write_table
-from icalib.tools.simulation.scenario.fields import at_least, mounted_fields, pose
-from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
-from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
-from icalib.tools.simulation.sensors.imu import rotation_from_vector
+from icalib.tools.simulation.scenario import (
+    BagEvent,
+    BagTopic,
+    Report,
+    SimScene,
+    SimSensor,
+    at_least,
+    mounted_fields,
+    pose,
+)
+from icalib.tools.simulation.trajectory import LEAD_S, stamped
 
 _POSE_MESSAGE = "geometry_msgs/msg/PoseStamped"
 

@@ -21,8 +21,7 @@ from icalib.sensors.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.sensors.parameter import Parameter
-from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.parameter import Parameter, ParameterSpec
 from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
 
 PoseKind = Literal["absolute", "relative"]

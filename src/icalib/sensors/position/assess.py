@@ -7,19 +7,16 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs, origin_difference
+from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.motion.factor import Whitened, pairs_of
 from icalib.result import RowResiduals, SensorFit
-from icalib.result.excess import excess, times
-from icalib.result.row_records import lag_one_correlation, row_record
-from icalib.result.timeline import Timeline
+from icalib.result.calibration import Timeline, lag_one_correlation, row_record
+from icalib.result.quantities import excess, times
 from icalib.rig import Rig
-from icalib.sensors.position.fix_errors import random_walk_of
 from icalib.sensors.position.model import FIRST_NOISE_M
-from icalib.sensors.position.residual import PositionFactor, PositionNoise
+from icalib.sensors.position.residual import SLOW_OFFSET, PositionFactor, PositionNoise, random_walk_of
 from icalib.sensors.position.spec import MESSAGES, PositionSensor
 from icalib.sensors.position.stream import PositionStream
-from icalib.sensors.position.walk_factor import SLOW_OFFSET
 
 # Correlation of successive residuals above which a warning is given: its value, and its value in standard errors. White
 # noise leaves 0 or less. At 0.1 the formal standard deviations of a lever arm were 1.4 times too small.

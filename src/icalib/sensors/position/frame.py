@@ -13,7 +13,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.geometry.targets.base import BOARD
-from icalib.model.frames import frame_of
+from icalib.model.sensor_model import frame_of
 from icalib.optim.state import Key, Layout, in_recording
 from icalib.rig.scene import FRAME_ROTATION, FRAME_TRANSLATION, FRAME_YAW, TILT
 from icalib.sensors.position.spec import PositionSensor

@@ -12,8 +12,7 @@ from icalib.data.recordings import Recording, TopicInfo
 from icalib.sensors.position.read import RECEIVER_KINDS, first_kinds
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import SensorSource, Sources
-from icalib.tools.inspection.kinds import Key, KindInspector
+from icalib.tools.inspection.facts import Key, KindInspector, SensorSource, Sources
 
 
 class PositionInspector(KindInspector):

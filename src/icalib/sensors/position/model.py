@@ -7,17 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from icalib.model.frames import frame_entries
-from icalib.model.sensor_model import Pass, SensorModel
-from icalib.model.statistics import ResidualStatistics
+from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel, frame_entries
 from icalib.optim.state import Entry
 from icalib.rig import Rig, Settings
 from icalib.rig.scene import FRAME, LEVEL_FRAME
 from icalib.sensors.position.frame import frame_owner
-from icalib.sensors.position.residual import PositionFactor, PositionNoise
+from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
 from icalib.sensors.position.spec import LEVELLED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
-from icalib.sensors.position.walk_factor import OffsetWalkFactor, knot_entries
 
 FIRST_NOISE_M = 0.05  # of each axis if no noise is stated: between that of differential and of carrier-phase fixes
 # Smallest entry of `PositionNoise` (m, or a factor): keeps the weights of fixes without any noise finite.

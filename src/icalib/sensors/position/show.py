@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.report.plot import COLORS, Figure, axis, dots, figure, line, thin
-from icalib.report.sections import Section, plot_place, row_sections
-from icalib.report.tables import Html, element
+from icalib.report.figures import COLORS, Figure, axis, dots, figure, line, thin
+from icalib.report.page import Html, Section, element, plot_place, row_sections
 from icalib.result import Calibration, RowResiduals
 
 OUTLIER_SIGMA = 3.0  # standard deviations: white noise exceeds it in 1 of 34 fixes (chi, three degrees of freedom)

@@ -13,9 +13,17 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.sensors.position.spec import LEVELLED, TILTED, PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation.output import BagWriter, write_table
-from icalib.tools.simulation.scenario.fields import at_least, mounted_fields, pose
-from icalib.tools.simulation.scenario.instants import LEAD_S, stamped
-from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
+from icalib.tools.simulation.scenario import (
+    BagEvent,
+    BagTopic,
+    Report,
+    SimScene,
+    SimSensor,
+    at_least,
+    mounted_fields,
+    pose,
+)
+from icalib.tools.simulation.trajectory import LEAD_S, stamped
 
 _POINT = "geometry_msgs/msg/PointStamped"
 

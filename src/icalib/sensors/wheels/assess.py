@@ -7,14 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs
-from icalib.geometry.vectors import is_near
-from icalib.initialize.steps.initializer import level_sensor
+from icalib.estimate.inputs import Inputs
+from icalib.geometry.small import is_near
+from icalib.initialize.initializer import level_sensor
 from icalib.motion.factor import of_type, pairs_of
 from icalib.result import ParameterGroup, RowResiduals, SensorFit
-from icalib.result.excess import excess, times
-from icalib.result.row_records import row_record
-from icalib.result.timeline import Timeline
+from icalib.result.calibration import Timeline, row_record
+from icalib.result.quantities import excess, times
 from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import HEIGHT, TILT, GroundFactor
 from icalib.sensors.wheels.residual import WheelFactor

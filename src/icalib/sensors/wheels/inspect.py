@@ -11,8 +11,7 @@ from icalib.data.messages import poses_and_twists
 from icalib.data.recordings import Recording, TopicInfo
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.wheels.spec import Wheels
-from icalib.tools.inspection.facts import Inspection, SensorSource, Sources
-from icalib.tools.inspection.kinds import KindInspector, moves_on_floor
+from icalib.tools.inspection.facts import Inspection, KindInspector, SensorSource, Sources, moves_on_floor
 
 
 class WheelInspector(KindInspector):

@@ -9,14 +9,11 @@ import numpy as np
 from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.motion.factor import Factor
-from icalib.motion.keyframe_placement import spaced
-from icalib.motion.sweep import EstimatedMotion
-from icalib.motion.time_offsets import instants
+from icalib.motion.poses import EstimatedMotion, instants, spaced
 from icalib.optim.state import Key, Layout
 from icalib.rig import Rig, Settings, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
-from icalib.sensors.wheels.integrals import integrals_of
-from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelFactor, WheelNoise
+from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelFactor, WheelNoise, integrals_of
 
 
 class WheelModel(SensorModel[Wheels, WheelNoise]):

@@ -17,35 +17,52 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from icalib.data.measurements import WheelPoses
-from icalib.motion.factor import FactorKey, RowFactor, Whitened
-from icalib.motion.imu_data import ImuData
-from icalib.motion.pose_rows import Extrinsics, relative_residuals
+from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.geometry import so3
+from icalib.motion.factor import (
+    Extrinsics,
+    FactorKey,
+    Into,
+    RobustNoise,
+    RowFactor,
+    Whitened,
+    add_rows,
+    in_chunks,
+    relative_residuals,
+)
+from icalib.motion.imu_data import ImuData, StampIntervals, choose_intervals, pose_intervals
 from icalib.motion.poses import (
+    EstimatedMotion,
     Poses,
     VelocityDerivatives,
+    instants,
+    offset_at,
     poses_and_velocity_derivatives,
     poses_at,
     poses_without_jacobians,
+    slices_by_clock,
 )
-from icalib.motion.row_sums import Into, RobustNoise, add_rows, in_chunks
 from icalib.motion.sensor_pose import N_POSE_PARAMETERS, Kinematics, SensorPose, rows_at
-from icalib.motion.stamp_intervals import StampIntervals, choose_intervals, pose_intervals
-from icalib.motion.sweep import EstimatedMotion
-from icalib.motion.time_offsets import instants, offset_at, slices_by_clock
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
 from icalib.rig import WheelKind, drive_names
-from icalib.sensors.wheels.drive_rows import KINDS, N_DRIVE, UNIT, UNITS, Kinds, coefficients
-from icalib.sensors.wheels.increment_kernels import MotionSamples, WheelParameters, increment_rows
-from icalib.sensors.wheels.planar_poses import RelativePoses, preintegrated
-from icalib.sensors.wheels.propagation_noise import propagation_noise
-from icalib.sensors.wheels.quadrature import Instants, quadrature
+from icalib.sensors.wheels.ground_factor import RelativePoses, preintegrated
+from icalib.sensors.wheels.increment_kernels import (
+    KINDS,
+    N_DRIVE,
+    UNIT,
+    UNITS,
+    Kinds,
+    MotionSamples,
+    WheelParameters,
+    coefficients,
+    increment_rows,
+)
 
 YAW_X_Y = slice(2, 5)  # planar rows among rotation x, y, z, position x, y, z of a relative pose
 
@@ -371,3 +388,115 @@ def _motion(
 
 def _samples(keyframe: np.ndarray, p: Poses) -> MotionSamples:
     return MotionSamples(keyframe, p.rotation, p.position, p.rate, p.velocity, p.J_keyframe, p.J_imu)
+
+
+# Propagated IMU noise in recorded relative poses of wheels whose end points lie between keyframes.
+#
+# The pose of each end point is propagated by the IMU from its keyframe. The lateral noise of relative poses by
+# equation (27) of the iCalib paper is tiny, as its model has no slip: 0.01 mm, as much as 20 ms of propagation. The
+# noise of a relative pose therefore includes that of the propagation.
+
+
+def propagation_noise(
+    first: Poses, last: Poses, propagated: np.ndarray, wheels: Extrinsics, imu: ImuData
+) -> np.ndarray:
+    """Covariance (n, 3, 3) of yaw, x and y [rad, m, m] of n relative poses due to the noise of the IMU.
+
+    first, last: poses of the IMU at both ends; propagated (n, 2): propagation time [s] from keyframe to each end.
+    wheels: their extrinsics. With the noise densities g and a of gyroscope and accelerometer, the variance after t
+    seconds is g^2 t for each angle and a^2 t^3 / 3 for each axis of position. Errors of the angles also rotate the
+    lever arm.
+    """
+    R, p = wheels.R, wheels.p
+    R_first_world = np.swapaxes(first.rotation, 1, 2)
+    R_first_last = R_first_world @ last.rotation
+    end = np.einsum("nij,nj->ni", R_first_world, last.position - first.position) + R_first_last @ p
+    J_position_rotation = R.T @ so3.hat_many(end), -R.T @ R_first_last @ so3.hat_many(p)
+    yaw = R.T[2]
+    gyro, accel = np.median(imu.variance[:, :2], axis=0)
+    out = np.zeros((len(propagated), 3, 3))
+    for t, J_position, sign in zip(propagated.T, J_position_rotation, (-1.0, 1.0), strict=True):
+        J = np.concatenate([np.broadcast_to(sign * yaw, (len(t), 1, 3)), J_position[:, :2]], axis=1)
+        out += (gyro * t)[:, None, None] * J @ np.swapaxes(J, 1, 2)
+        out += (accel * t**3 / 3.0)[:, None, None] * np.diag([0.0, 1.0, 1.0])
+    return out
+
+
+# Instants and weights of the quadrature that integrates the motion of wheels between two of their stamps.
+
+# Largest length of a panel. The error of two Gauss points is u'''' h^5 / 4320: 0.01 mm for 20 Hz vibration of 3 m/s^2.
+PANEL_S = 0.025
+
+
+class Instants(NamedTuple):
+    """The m instants at which the motion is evaluated for n intervals.
+
+    start (n + 1,): interval i has the instants start[i]:start[i+1]: its begin, the quadrature points, its end. times
+    (m,) [s] on the wheels' clock; keyframe (m,): keyframe from which the motion is propagated; weight (m,) [s]:
+    quadrature weight, zero at begin and end.
+    """
+
+    start: np.ndarray
+    times: np.ndarray
+    keyframe: np.ndarray
+    weight: np.ndarray
+
+
+def quadrature(seconds: np.ndarray, intervals: StampIntervals, change: np.ndarray | None = None) -> Instants:
+    """Instants with two Gauss points in each panel of at most PANEL_S; seconds (N,): the stamps of the wheels.
+
+    change (n,) [s] on the wheels' clock: instants up to `change` are propagated from the first keyframe of the
+    interval, later ones from the second; by default the middle of the interval.
+    """
+    begin = seconds[intervals.first]
+    length = seconds[intervals.last] - begin
+    # Each half of an interval is split into panels. Its instants are begin, two Gauss points per panel, and end.
+    panels = np.maximum(np.ceil(0.5 * length / PANEL_S - 1e-6), 1.0).astype(np.int64)  # in half an interval
+    start = np.concatenate([[0], np.cumsum(2 + 4 * panels)])
+    interval = np.repeat(np.arange(len(begin)), np.diff(start))
+    at = np.arange(start[-1]) - start[interval] - 1
+    width = (0.5 * length / panels)[interval]
+    panel, second = at // 2, at % 2
+    times = begin[interval] + (panel + 0.5 + (second - 0.5) / np.sqrt(3.0)) * width
+    weight = 0.5 * width
+    change = begin + 0.5 * length if change is None else change
+    keyframe = intervals.keyframe[interval] + (times > change[interval])
+    # begin and end of the intervals have no weight: only poses are evaluated there
+    times[start[:-1]], times[start[1:] - 1] = begin, seconds[intervals.last]
+    keyframe[start[:-1]], keyframe[start[1:] - 1] = intervals.keyframe, intervals.keyframe + 1
+    weight[start[:-1]] = weight[start[1:] - 1] = 0.0
+    return Instants(start, times, keyframe, weight)
+
+
+# Integrals of the rates that wheels report: angles, distance and yaw since the first stamp.
+
+Sampling = Literal["interval-mean", "instantaneous"]
+MAX_STEERING_RAD = 1.55  # 89 deg: limit of steering angles; 1 / cos is infinite at 90 deg
+
+
+def integrated(seconds: np.ndarray, rates: np.ndarray, sampling: Sampling) -> np.ndarray:
+    """Integrals (N, m) since the first stamp of rates (N, m) at seconds (N,).
+
+    sampling "interval-mean": a rate is the mean over the interval that ends at its stamp, as computed from differences
+    of ticks. "instantaneous": a rate is the value at its stamp (trapezoidal rule). The wrong choice shifts time by half
+    an interval.
+    """
+    mean = rates[1:] if sampling == "interval-mean" else 0.5 * (rates[1:] + rates[:-1])
+    integrals = np.zeros_like(rates, dtype=np.float64)
+    np.cumsum(mean * np.diff(seconds)[:, None], axis=0, out=integrals[1:])
+    return integrals
+
+
+def integrals_of(stream: WheelStream) -> np.ndarray:
+    """Integrals since the first stamp from which the increment factor takes its measurements, for each kind of wheels.
+
+    pair (N, 2): angles that both wheels turned [rad]. twist (N, 2): distance [m], yaw [rad]. steered (N, 4): angle that
+    the driven wheel turned [rad], integrals of cos and sin of the steering angle [s], and the integral of
+    (rate of the wheel / cos)^2 [rad^2/s]. The variance of the steering row is proportional to the last.
+    """
+    integrals = integrated(stream.seconds, stream.rate, stream.sampling)
+    if stream.kind != "steered":
+        return integrals
+    rate, steer = stream.rate[:, 0], np.clip(stream.rate[:, 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
+    others = np.stack([np.cos(steer), np.sin(steer), (rate / np.cos(steer)) ** 2], axis=1)
+    return np.concatenate([integrals[:, :1], integrated(stream.seconds, others, "instantaneous")], axis=1)

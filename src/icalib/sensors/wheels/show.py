@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.report.rig_shapes import CIRCLE, PEN_UP
-from icalib.report.sections import Section, row_sections
+from icalib.report.page import Section, row_sections
+from icalib.report.rig_figures import CIRCLE, PEN_UP
 from icalib.result import Calibration
 
 LEGEND = "pairs of discs are wheels"

@@ -15,12 +15,9 @@ from icalib.data.measurements import WheelPoses, WheelStream
 from icalib.errors import RigError
 from icalib.sensors.wheels.spec import WheelKind, Wheels, drive_names
 from icalib.tools.simulation.output import BagWriter, write_table
-from icalib.tools.simulation.scenario.fields import at_least, mounted_fields
-from icalib.tools.simulation.scenario.instants import LEAD_S, check_enough, stamped
-from icalib.tools.simulation.scenario.robot import Drive
-from icalib.tools.simulation.scenario.room import Room
-from icalib.tools.simulation.scenario.sensor import BagEvent, BagTopic, Report, SimScene, SimSensor
-from icalib.tools.simulation.scenario.trajectory import TrueTrajectory
+from icalib.tools.simulation.room import Room
+from icalib.tools.simulation.scenario import BagEvent, BagTopic, Report, SimScene, SimSensor, at_least, mounted_fields
+from icalib.tools.simulation.trajectory import LEAD_S, Drive, TrueTrajectory, check_enough, stamped
 
 _GAUSS = np.polynomial.legendre.leggauss(3)  # points and weights on [-1, 1]
 _MAX_STEERING_RAD = 1.3  # largest angle of front wheels; those of a car reach 0.7

@@ -22,8 +22,7 @@ from icalib.sensors.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.sensors.parameter import Parameter, check_sizes
-from icalib.sensors.parameter_spec import ParameterSpec
+from icalib.sensors.parameter import Parameter, ParameterSpec, check_sizes
 from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sampling, Sensor, TableLayout
 
 WheelFactor = Literal["increments", "relative-poses"]

@@ -1,6 +1,7 @@
 """Noise densities, bias walks and bias instabilities of an IMU, from a recording at rest."""
 
 from icalib.tools.allan.analysis import (
+    AllanFit,
     Deviation,
     ImuNoiseStudy,
     SensorNoise,
@@ -9,7 +10,6 @@ from icalib.tools.allan.analysis import (
     study_recording,
 )
 from icalib.tools.allan.files import write_study
-from icalib.tools.allan.fit import AllanFit
 
 __all__ = [
     "Deviation",

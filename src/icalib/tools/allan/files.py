@@ -18,11 +18,9 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.base.files import check_writable, json_text, printable, refuse_foreign, sealed_texts, write_texts
-from icalib.report.page import document, resource
-from icalib.report.plot import AXIS_COLORS, Figure, axis, figure, line
-from icalib.report.tables import Html, element, html, sentences
-from icalib.tools.allan.analysis import AXES, ImuNoiseStudy, SensorNoise, model_variance
-from icalib.tools.allan.fit import AllanFit
+from icalib.report.figures import AXIS_COLORS, Figure, axis, figure, line
+from icalib.report.page import Html, document, element, html, resource, sentences
+from icalib.tools.allan.analysis import AXES, AllanFit, ImuNoiseStudy, SensorNoise, model_variance
 
 FILES = ("allan.html", "noise.yaml", "allan.json")
 

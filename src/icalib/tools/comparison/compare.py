@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+import dataclasses
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from math import erfc, exp, floor, gamma, log10, sqrt
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
+from icalib.base.files import json_text, printable
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.sensors.parameter_spec import display_unit
-from icalib.sensors.sensor import TIME_OFFSET
-from icalib.tools.comparison.sides import LensSide, Quantity, Side
-from icalib.tools.comparison.significance import sigmas
-from icalib.tools.comparison.units import DEFAULT_TOLERANCES
+from icalib.result import Calibration, joint_covariance, relative_pose
+from icalib.result.verdict import UNUSABLE
+from icalib.rig import Parameter, ParameterSpec, Sensor
+from icalib.rig.file import load_rig
+from icalib.rig.rig import SENSOR_TYPES
+from icalib.sensors.parameter import display_unit
+from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
 
 _GRID = (24, 18)  # columns and rows of the grid of pixels at which lenses are compared
 
@@ -240,3 +248,372 @@ def distance_px(a: LensSide, b: LensSide) -> tuple[float, float]:
     projections, valid = camera_model(b.model).project(b.params, rays[ok])
     off = np.linalg.norm(projections - uv[ok], axis=1)[valid]
     return float(np.sqrt((off**2).mean())), float(off.max())
+
+
+# Sides of a comparison from a result of icalib, or from a rig file with values from CAD or a data sheet.
+
+DENSITIES = {
+    "gyro": "noise density of the gyroscope",
+    "gyro_walk": "bias walk of the gyroscope",
+    "accel": "noise density of the accelerometer",
+    "accel_walk": "bias walk of the accelerometer",
+}
+
+
+def compared_specs(kind: type[Sensor]) -> dict[str, ParameterSpec]:
+    """The parameters of a kind of sensor that are compared as quantities, by name. Extrinsics are compared as poses,
+    and parameters of a lens by projection."""
+    return {s.name: s for s in kind.stated() if s not in (ROTATION, TRANSLATION) and not s.by_images}
+
+
+def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:
+    """Noise densities as quantities by (imu, name), without standard deviation. noise: densities by name."""
+    return {
+        (imu, key): Quantity(what, ("",), np.array([float(noise[key])]), unknown(1)) for key, what in DENSITIES.items()
+    }
+
+
+def side_of_result(c: Calibration, path: str) -> Side:
+    """The side of a calibration, with covariances; path: its name in messages."""
+    poses = {name: _pose_of_result(c, name) for name in c.mounted} | {c.reference: np.eye(4)}
+    bad = [g for g in c.groups if {*UNUSABLE} & {*g.verdict}]
+    quantities = {}
+    for g in c.groups:
+        # If a clock restarts in each recording, its time offsets have no counterpart in another result.
+        several = g.name == TIME_OFFSET.name and len(g.value) > 1
+        if g.sensor in c.mounted and not several:
+            spec = compared_specs(SENSOR_TYPES[c.rig["sensors"][g.sensor]["type"]]).get(g.name)
+            if spec is not None:
+                quantities[g.sensor, g.name] = quantity(spec, g.value, joint_covariance(c, [g]), g in bad)
+    if c.imu is not None:
+        quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
+        intrinsics = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
+        for g in intrinsics:
+            quantities[c.imu, g.name] = Quantity(
+                g.name, g.labels, g.value, joint_covariance(c, [g]), g in bad, g.unit, False
+            )
+    return Side(
+        path=path,
+        kind="result",
+        body=c.reference,
+        has_imu=c.imu is not None,
+        poses=poses,
+        covariance=lambda frame, sensor: relative_pose(c, frame, sensor).covariance,
+        open=frozenset((g.sensor, g.name) for g in bad),
+        quantities=quantities,
+        lenses={name: _lens_of_result(c, name) for name in c.lenses},
+    )
+
+
+def _pose_of_result(c: Calibration, sensor: str) -> np.ndarray:
+    """(4, 4) T_body_sensor; the rotation is NaN if the sensor has none, such as a position sensor."""
+    T = c.T_imu_sensor(sensor)
+    if not any((g.sensor, g.name) == (sensor, ROTATION.name) for g in c.groups):
+        T[:3, :3] = np.nan
+    return T
+
+
+def _lens_of_result(c: Calibration, name: str) -> LensSide:
+    groups = [c.group(name, key) for key in c.lenses[name]]
+    is_open = any({*UNUSABLE} & {*g.verdict} for g in groups)
+    return _lens(c.rig["sensors"][name], [g.value for g in groups], joint_covariance(c, groups), is_open)
+
+
+def _lens(fields: dict[str, Any], values: list[np.ndarray], covariance: np.ndarray, is_open: bool = False) -> LensSide:
+    """A lens. fields: those of its sensor in the rig file; values: those of its parameter groups."""
+    width, height = fields["resolution"]
+    return LensSide(fields["model"], (int(width), int(height)), np.concatenate(values), covariance, is_open)
+
+
+def side_of_rig(path: Path) -> Side:
+    """The side of a rig file: its guesses, fixed values and priors, the latter with their sigma. Raises RigError if the
+    file is wrong."""
+    rig = load_rig(path)
+    poses = {s.name: _pose_of_rig(s) for s in rig.mounted} | {rig.reference: np.eye(4)}
+    quantities = {}
+    for s in rig.mounted:
+        for spec in compared_specs(type(s)).values():
+            p: Parameter = getattr(s, spec.name)
+            if p.value is not None:
+                value = np.atleast_1d(p.value)
+                quantities[s.name, spec.name] = quantity(spec, value, _covariance(p, value.size))
+    if rig.imu is not None:
+        noise = {key: getattr(rig.imu.noise, key) for key in DENSITIES}
+        quantities |= noise_quantities(rig.imu.name, noise)
+
+    def covariance(frame: str, sensor: str) -> np.ndarray:
+        out = unknown(6)
+        if frame == rig.reference:
+            for block, p in zip((slice(3), slice(3, 6)), _extrinsics(rig.sensors[sensor]), strict=True):
+                out[block, block] = _covariance(p, 3)
+        return out
+
+    return Side(
+        path=str(path),
+        kind="rig file",
+        body=rig.reference,
+        has_imu=rig.imu is not None,
+        poses=poses,
+        covariance=covariance,
+        quantities=quantities,
+        lenses={s.name: lens for s in rig.mounted if s.lens and (lens := _lens_of_rig(s)) is not None},
+    )
+
+
+def quantity(spec: ParameterSpec, value: np.ndarray, covariance: np.ndarray, is_open: bool = False) -> Quantity:
+    """Quantity of a parameter group. A group of one number has an empty label."""
+    labels = spec.labels if spec.size > 1 else ("",)
+    what = (spec.one or spec.name).replace("_", " ")
+    return Quantity(what, labels, value, covariance, is_open, spec.unit, spec.is_positive)
+
+
+def _extrinsics(sensor: Sensor) -> tuple[Parameter, Parameter]:
+    """Rotation and translation; a Parameter without value if the sensor has none."""
+    return getattr(sensor, ROTATION.name, Parameter()), getattr(sensor, TRANSLATION.name, Parameter())
+
+
+def _pose_of_rig(sensor: Sensor) -> np.ndarray:
+    """(4, 4) T_body_sensor; NaN for values that the rig file does not give."""
+    (rotation, translation), T = _extrinsics(sensor), np.eye(4)
+    T[:3, :3] = np.nan if rotation.value is None else rotation.value
+    T[:3, 3] = np.nan if translation.value is None else translation.value
+    return T
+
+
+def _covariance(p: Parameter, size: int) -> np.ndarray:
+    return unknown(size) if p.sigma is None else np.diag(np.broadcast_to(p.sigma, size) ** 2)
+
+
+def _lens_of_rig(sensor: Sensor) -> LensSide | None:
+    """The lens of a sensor; None if the rig file does not give all its values."""
+    values = [getattr(sensor, name).value for name in sensor.lens]
+    if any(value is None for value in values):
+        return None
+    return _lens(sensor.plain(), values, unknown(sum(map(len, values))))
+
+
+# One side of a comparison: poses, time offsets, lenses and other quantities of sensors, as far as they are known.
+
+PoseCovariance = Callable[[str, str], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A parameter that is compared by its value. what: its name in sentences; value (n,) in `unit` (SI); covariance
+    (n, n), NaN if unknown; open: unobservable or too uncertain; is_relative: changes are relative to the value."""
+
+    what: str
+    labels: tuple[str, ...]
+    value: np.ndarray
+    covariance: np.ndarray
+    open: bool = False
+    unit: str = ""
+    is_relative: bool = True
+
+
+@dataclass(frozen=True)
+class LensSide:
+    """A camera model. resolution: (width, height) px; params (n,): fx, fy, cx, cy [px], distortion; covariance (n, n),
+    NaN if unknown; open: unobservable or too uncertain."""
+
+    model: str
+    resolution: tuple[int, int]
+    params: np.ndarray
+    covariance: np.ndarray
+    open: bool = False
+
+
+@dataclass(frozen=True)
+class Side:
+    """One side of a comparison. kind: of its file; body: the sensor that is the reference frame; has_imu: whether the
+    body is an IMU. poses: T_body_sensor (4, 4) by sensor, the body included; NaN for unknown parts.
+
+    covariance(frame, sensor): (6, 6) of T_frame_sensor, rotation in the sensor's axes [rad], then translation [m]; NaN
+    if unknown. open: (sensor, "rotation" or "translation") that the data of a result did not determine.
+    quantities: by sensor and key ("time_offset", "radii", "baseline", "gyro", ...). lenses: by camera.
+    """
+
+    path: str
+    kind: str
+    body: str
+    has_imu: bool
+    poses: dict[str, np.ndarray] = field(default_factory=dict)
+    covariance: PoseCovariance = lambda frame, sensor: unknown(6)
+    open: frozenset[tuple[str, str]] = frozenset()
+    quantities: dict[tuple[str, str], Quantity] = field(default_factory=dict)
+    lenses: dict[str, LensSide] = field(default_factory=dict)
+
+    def T(self, frame: str, sensor: str) -> np.ndarray:
+        """(4, 4) T_frame_sensor; NaN for unknown parts."""
+        a, b, out = self.poses[frame], self.poses[sensor], np.eye(4)
+        if frame == self.body:
+            return b
+        out[:3, :3] = a[:3, :3].T @ b[:3, :3]
+        out[:3, 3] = a[:3, :3].T @ (b[:3, 3] - a[:3, 3])
+        return out
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """Names of all sensors with a pose, a quantity or a lens."""
+        return tuple(dict.fromkeys([*self.poses, *(name for name, _ in self.quantities), *self.lenses]))
+
+    def renamed(self, old: str, new: str) -> Side:
+        """This side with the sensor `old` renamed to `new`."""
+
+        def now(name: str) -> str:
+            return new if name == old else name
+
+        def covariance(frame: str, sensor: str) -> np.ndarray:
+            return self.covariance(*(old if name == new else name for name in (frame, sensor)))
+
+        return dataclasses.replace(
+            self,
+            body=now(self.body),
+            poses={now(name): T for name, T in self.poses.items()},
+            covariance=covariance,
+            open=frozenset((now(name), key) for name, key in self.open),
+            quantities={(now(name), key): q for (name, key), q in self.quantities.items()},
+            lenses={now(name): lens for name, lens in self.lenses.items()},
+        )
+
+
+def unknown(size: int) -> np.ndarray:
+    """(size, size) NaN: an unknown covariance."""
+    return np.full((size, size), np.nan)
+
+
+# Significance of a difference, in standard deviations of a normal variable.
+
+_SINGULAR = 1e-10  # smaller eigenvalues of the correlation matrix are zero
+_SMALLEST_P = 1e-14  # the normal quantile of a smaller probability has lost its digits
+
+
+def sigmas(difference: np.ndarray, covariance: np.ndarray) -> float | None:
+    """Significance of a difference (n,) with covariance (n, n): the two-sided normal deviate that has the p-value of
+    its Mahalanobis distance.
+
+    None if the covariance is unknown (NaN), or if an entry with variance 0 differs. Entries with variance 0 that do not
+    differ are left out.
+    """
+    if not np.isfinite(covariance).all():
+        return None
+    loose = np.diag(covariance) > 0
+    if not loose.any() or np.any(difference[~loose] != 0):
+        return None
+    scale = np.sqrt(np.diag(covariance)[loose])
+    correlation = covariance[np.ix_(loose, loose)] / np.outer(scale, scale)
+    whitened = difference[loose] / scale
+    chi2 = float(whitened @ np.linalg.pinv(correlation, _SINGULAR, hermitian=True) @ whitened)
+    dof = int(np.linalg.matrix_rank(correlation, _SINGULAR * len(scale), hermitian=True))
+    p = chi2_above(chi2, dof)
+    return sqrt(chi2) if p < _SMALLEST_P else max(0.0, NormalDist().inv_cdf(1.0 - 0.5 * p))
+
+
+def chi2_above(x: float, dof: int) -> float:
+    """Probability that chi^2 with `dof` degrees of freedom is above x (Abramowitz and Stegun 26.4.4, 26.4.5)."""
+    half = 0.5 * x
+    p = erfc(sqrt(half)) if dof % 2 else exp(-half)
+    return p + sum(exp(-half) * half ** (0.5 * k - 1.0) / gamma(0.5 * k) for k in range(4 - dof % 2, dof + 1, 2))
+
+
+# Units of tolerances; a module without imports, so that the command line starts fast.
+
+# Tolerances of differences without a known standard deviation.
+DEFAULT_TOLERANCES = {"deg": 0.1, "mm": 5.0, "ms": 1.0, "px": 1.0, "percent": 0.1}
+UNITS = tuple(DEFAULT_TOLERANCES)
+
+
+# A comparison as sentences, and as JSON.
+
+_ALONG = 0.95  # a vector is along one axis if this component is a larger share of its norm
+ROUNDING = 1e-6  # deg, mm, ms, px, %: smaller differences come from the arithmetic, such as that of unprojection
+_TITLES = {True: "same", False: "DIFFERS"}
+
+
+def lines(comparison: Comparison) -> list[str]:
+    """Lines to print: the two sides, a line for each block (differing ones first), notes, and the verdict."""
+    c = comparison
+    text_lines = [f"A: {c.a.path} ({c.a.kind})", f"B: {c.b.path} ({c.b.kind}); from A to B:"]
+    width = max(map(len, _TITLES.values()))
+    for d in sorted(c.differences, key=lambda d: not d.differs):
+        text_lines.append(f"  {_TITLES[not d.differs]:<{width}}  {sentence(d, c)}")
+    text_lines += [f"Note: {note}" for note in c.notes]
+    count = sum(d.differs for d in c.differences)
+    return [*text_lines, "The same." if c.same else f"{count} of {len(c.differences)} differ."]
+
+
+def sentence(d: Difference, c: Comparison) -> str:
+    """A sentence on one difference, such as "cam1 turned by 0.12 deg about its x axis, 4.0 sigma"."""
+    relative = "" if d.frame in (c.reference, d.sensor) else f" relative to {d.frame}"
+    if d.size < ROUNDING:
+        return f"the {d.what} of {d.sensor}{relative} did not change{_open_words(d)}"
+    match d.what:
+        case "rotation":
+            turn = _axis(d, "about its {} axis", "about its axis {}")
+            words = f"{d.sensor} turned by {turn}{relative}"
+        case "translation":
+            along = f"along {{}} of {d.frame}"
+            words = f"{d.sensor} moved by {_axis(d, along, along)}"
+        case "lens":
+            words = (
+                f"the lens of {d.sensor} moved points by {digits(d.size)} px RMS, {digits(d.most or 0.0)} px at most"
+            )
+        case _:
+            most = int(np.argmax(np.abs(d.vector)))
+            unit = "%" if d.unit == "percent" else d.unit
+            label = f"{d.labels[most]} " if d.labels[most] else ""
+            words = f"the {label}{d.what} of {d.sensor} changed by {_signed(d.vector[most])} {unit}"
+    return f"{words}, {_certainty(d)}"
+
+
+def comparison_json(comparison: Comparison) -> str:
+    """The comparison as JSON."""
+    c = comparison
+    plain = {
+        "a": {"path": c.a.path, "kind": c.a.kind},
+        "b": {"path": c.b.path, "kind": c.b.kind},
+        "same": c.same,
+        "reference": c.reference,
+        "differences": [dataclasses.asdict(d) | {"sentence": sentence(d, c)} for d in c.differences],
+        "notes": list(c.notes),
+    }
+    return printable(json_text(plain))
+
+
+def digits(value: float) -> str:
+    """The value with two significant digits; with an exponent below 1e-4 and from 1e5 on."""
+    if value == 0.0 or not 1e-4 <= abs(value) < 1e5:
+        return f"{value:.1e}" if value else "0"
+    return f"{value:.{max(0, 1 - floor(log10(abs(value))))}f}"
+
+
+def _signed(value: float) -> str:
+    return f"{'+' if value >= 0 else '-'}{digits(abs(value))}"
+
+
+def _axis(d: Difference, one: str, several: str) -> str:
+    """Size and direction of a vector. one: format for a coordinate axis, along which the component has its sign;
+    several: format for a unit vector."""
+    vector = np.array(d.vector)
+    most = int(np.argmax(np.abs(vector)))
+    if abs(vector[most]) >= _ALONG * d.size:
+        return f"{digits(float(vector[most]))} {d.unit} {one.format(d.labels[most])}"
+    axis = ", ".join(f"{v:.2f}" for v in vector / d.size)
+    return f"{digits(d.size)} {d.unit} {several.format(f'[{axis}]')}"
+
+
+def _certainty(d: Difference) -> str:
+    if d.sigmas is None:
+        words = f"no standard deviation is known (tolerance {_tolerance(d)})"
+    else:
+        words = f"{d.sigmas:.1f} sigma" + (f" of {d.given_by} alone" if d.given_by in ("A", "B") else "")
+        words += f" (tolerance {_tolerance(d)})" if d.tolerance > 0 else ""
+    return words + _open_words(d)
+
+
+def _open_words(d: Difference) -> str:
+    return f", unobservable or too uncertain in {' and '.join(d.open)}" if d.open else ""
+
+
+def _tolerance(d: Difference) -> str:
+    return f"{d.tolerance:g} {'%' if d.unit == 'percent' else d.unit}"

@@ -7,18 +7,29 @@ from contextlib import closing
 from math import isfinite
 from pathlib import Path
 
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
 from icalib.base.files import printable, refuse_foreign, refuse_foreign_set, sealed
 from icalib.errors import CalibrationError
 from icalib.tools.batch import Crew, FailedTask, exclusive_lock, run_all, write_atomically
-from icalib.tools.fleet.drift import drift_of
-from icalib.tools.fleet.inputs import InputHashes
-from icalib.tools.fleet.jobs import Job, load_jobs
-from icalib.tools.fleet.one_job import JobTask, run
-from icalib.tools.fleet.page import fleet_html
-from icalib.tools.fleet.record import JobRecord
-from icalib.tools.fleet.result import Fleet, JobResult, by_robot
-from icalib.tools.fleet.store import JobStore, to_do
-from icalib.tools.fleet.table import write_table
+from icalib.tools.fleet import page
+from icalib.tools.fleet.page import fleet_html, write_table
+from icalib.tools.fleet.result import (
+    Fleet,
+    InputHashes,
+    Job,
+    JobRecord,
+    JobResult,
+    JobStore,
+    JobTask,
+    by_robot,
+    drift_of,
+    load_jobs,
+    run,
+    to_do,
+)
 
 Progress = Callable[[str, float], None]
 TABLE, PAGE = "fleet.sqlite", "fleet.html"
@@ -94,3 +105,38 @@ def _do(tasks: list[JobTask], store: JobStore, crew: Crew, total: int, progress:
             f"{n_stored} of {total} jobs are in {store.folder}; the same command resumes."
         ) from None
     return records
+
+
+# Prints the result of a fleet on the terminal.
+
+MOST = 20  # sentences of each kind that are printed; fleet.html has all
+
+
+def print_fleet(fleet: Fleet, folder: Path) -> None:
+    """Prints a row for each robot, failures, changes, and the paths of the files on standard output."""
+    console = Console()
+    console.print(table(fleet))
+    console.print(page.answer(fleet), markup=False)
+    if any(d.n_tested for d in fleet.drifts):
+        console.print(page.chance_words(fleet), markup=False)
+    for title, sentences in (
+        ("Failed", page.failures(fleet)),
+        ("Changed", page.changes(fleet)),
+        ("Cannot be judged", page.unsure(fleet)),
+        ("Note", page.notes(fleet)),
+    ):
+        for sentence in sentences[:MOST]:
+            console.print(f"{title}: {sentence}", markup=False)
+        if len(sentences) > MOST:
+            console.print(f"{title}: {len(sentences) - MOST} more, in fleet.html", markup=False)
+    console.print(f"Wrote {folder / 'fleet.html'}, fleet.sqlite, and a result for each job in jobs.", markup=False)
+
+
+def table(fleet: Fleet) -> Table:
+    """One row for each robot."""
+    out = Table(title="Fleet", title_justify="left", box=SIMPLE_HEAD, padding=(0, 1))
+    for header in page.ROBOT_HEADERS:
+        out.add_column(header, justify="right" if header in page.ROBOT_HEADERS[1:3] else "left")
+    for row in page.robot_rows(fleet):
+        out.add_row(*map(str, row))
+    return out

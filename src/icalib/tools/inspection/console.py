@@ -16,8 +16,7 @@ from rich.text import Text
 
 from icalib.base.files import json_text
 from icalib.geometry.targets import Scene
-from icalib.tools.inspection.facts import Inspection, StreamFacts
-from icalib.tools.inspection.kinds import inspectors, named, plain
+from icalib.tools.inspection.facts import Inspection, StreamFacts, inspectors, named, plain
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
 _ANSWERS = {

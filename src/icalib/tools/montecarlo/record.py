@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
-from icalib.tools.batch import plain_record, record_json
+from icalib.base.files import writing
+from icalib.errors import CalibrationError
+from icalib.geometry import so3
+from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration, Visited
+from icalib.result.calibration import versions
+from icalib.sensors.stream import Successive
+from icalib.tools.batch import check_worker, plain_record, program, record_json, sentence_on, write_atomically
+from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
 
 FORMAT = 2
 LEAST_SIGMA = 1e-100  # replaces a standard deviation of 0, so that an error over it is finite
@@ -121,3 +132,192 @@ def from_json(text: bytes) -> RunRecord:
 
 def _block(plain: dict[str, Any]) -> GroupErrors:
     return GroupErrors(plain["sensor"], plain["name"], tuple(plain["labels"]), plain["unit"], tuple(plain["verdict"]))
+
+
+# One run: simulate, calibrate, compare with the truth. Exceptions become part of the record of the run.
+#
+# Errors of a result, as the perturbations that its covariance describes. Whiteness of residuals: lag-one
+# autocorrelation of whitened residuals in time.
+
+GuessKind = Literal["none", "drawn"]
+PlanesKind = Literal["known", "found"]
+
+
+@dataclass(frozen=True, eq=False)
+class RunTask:
+    """Inputs of a run. guess: "none", the program finds the initial guess; "drawn", the guess is drawn at random about
+    the truth. Without a target, intrinsics always have a drawn guess, because feature tracks alone do not determine
+    them. planes: the plane of each LiDAR point is "known", or "found" in the clouds."""
+
+    scenario: Scenario
+    seed: int
+    guess: GuessKind = "none"
+    planes: PlanesKind = "known"
+
+
+def run(task: RunTask) -> RunRecord:
+    """Simulates and calibrates. Extrinsics, time offsets, intrinsics and distortions are estimated. The record depends
+    on the task alone, except for its `seconds`."""
+    started, visits = time.perf_counter(), list[Visited]()
+    try:
+        simulation = simulate(task.scenario, task.seed)
+        rig = rig_for(task.scenario, intrinsics="free", distortion="free")
+        if task.guess == "drawn" or not rig.has_target:
+            only = None if task.guess == "drawn" else ("intrinsics",)
+            rig = with_drawn_guess(rig, task.scenario, task.seed, only=only)
+        measurements = simulation.measurements
+        if task.planes == "found":
+            measurements = measurements.unassociated()
+        result = calibrate_measurements(rig, measurements, on_visit=visits.append)
+    except Exception as caught:
+        return RunRecord(task.seed, sentence_on(caught), time.perf_counter() - started, program())
+    return compare(task.seed, result, simulation.truth, visits, time.perf_counter() - started)
+
+
+def compare(seed: int, result: Calibration, truth: Truth, visits: list[Visited], seconds: float) -> RunRecord:
+    """The record of a run that reached a result. visits: estimates at the solver's iterations; seconds: run time."""
+    blocks, errors, columns = [], [np.empty(0)], list[int]()
+    for g in result.groups:
+        true = true_value(truth, g.sensor, g.name)
+        if g.columns is not None and true is not None:
+            blocks.append(GroupErrors(g.sensor, g.name, g.labels, g.unit, g.verdict))
+            errors.append(error(g.name, g.value, true))
+            columns += g.columns
+    return RunRecord(
+        seed,
+        result.failure,
+        seconds,
+        program(),
+        tuple(blocks),
+        np.concatenate(errors),
+        result.covariance[np.ix_(columns, columns)],
+        result.unobservable,
+        tuple(Size(f.sensor, f.kind, f.count, f.dof, f.chi2) for f in result.fits),
+        whiteness(result),
+        _path(tuple(blocks), truth, visits),
+    )
+
+
+def _path(blocks: tuple[GroupErrors, ...], truth: Truth, visits: list[Visited]) -> tuple[Waypoint, ...]:
+    """Waypoints from the last initial guess to the result; visits before it belong to guesses that were given up."""
+    stages = [v.stage for v in visits]
+    begins = [k for k, stage in enumerate(stages) if k == 0 or (stage == stages[0] and stages[k - 1] != stage)]
+    return tuple(_waypoint(blocks, truth, v) for v in visits[begins[-1] :]) if visits else ()
+
+
+def _waypoint(blocks: tuple[GroupErrors, ...], truth: Truth, visit: Visited) -> Waypoint:
+    errors, deviations = [np.empty(0)], [np.empty(0)]
+    for b in blocks:
+        true = true_value(truth, b.sensor, b.name)
+        assert true is not None  # `compare` sees to it
+        errors.append(error(b.name, visit.values[b.sensor, b.name], true))
+        deviations.append(visit.std[b.sensor, b.name])
+    return Waypoint(visit.stage, np.concatenate(errors), np.concatenate(deviations))
+
+
+def true_value(truth: Truth, sensor: str, name: str) -> np.ndarray | None:
+    """True value of the group `name` of `sensor`, in the form of `ParameterGroup.value`; None if the truth has none, as
+    for the tilt of a target."""
+    return truth.values.get(sensor, {}).get(name)
+
+
+def error(name: str, value: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(n,) estimated minus true; for rotations e of R_estimated = R_true Exp(e) [rad], in the sensor's axes."""
+    return so3.log(np.ascontiguousarray(true.T @ value)) if name == "rotation" else value - true
+
+
+def whiteness(result: Calibration) -> tuple[Whiteness, ...]:
+    """Whiteness of each kind of residual in `result`."""
+    return tuple(
+        _statistics(r.sensor, name, rows)
+        for r in result.residuals.values()
+        for name, rows in r.successive().items()
+        if len(rows.whitened)
+    )
+
+
+def _statistics(sensor: str, kind: str, rows: Successive) -> Whiteness:
+    """Mean square of whitened residuals, and correlation of each with its successor."""
+    values = rows.whitened
+    first, second = values[:-1][rows.follows], values[1:][rows.follows]
+    mean_square = float(np.mean(values**2)) if values.size else 0.0
+    power = float(np.sqrt((first**2).sum() * (second**2).sum()))
+    return Whiteness(sensor, kind, mean_square, float((first * second).sum()) / power if power > 0.0 else 0.0)
+
+
+# The folder of a study: one file per run, written atomically, and study.json with the inputs of all runs.
+
+STUDY, RUNS = "study.json", "runs"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """Inputs that all runs of a folder share. scenario: its name; scenario_sha256: of the scenario file and the
+    trajectory file that it names; guess, planes: see `RunTask`; program, versions: of icalib, Python and libraries."""
+
+    scenario: str
+    scenario_sha256: str
+    guess: GuessKind
+    planes: PlanesKind
+    program: str
+    versions: dict[str, str]
+
+    @classmethod
+    def of(cls, scenario: str, scenario_sha256: str, guess: GuessKind, planes: PlanesKind) -> Identity:
+        """The identity with the program and the versions of this process."""
+        return cls(scenario, scenario_sha256, guess, planes, program(), versions())
+
+
+_CHANGED = {
+    "scenario_sha256": "the scenario changed",
+    "guess": "their initial guess differs",
+    "planes": "planes are known in one study and found in the other",
+    "program": "icalib changed",
+    "versions": "Python or a library changed",
+}
+
+
+class RunStore:
+    """Records of runs by seed in a folder. Raises CalibrationError if the folder has runs of another study, or cannot
+    be written."""
+
+    def __init__(self, folder: Path, identity: Identity) -> None:
+        self.folder, self.identity = folder, identity
+        with writing(folder):
+            (folder / RUNS).mkdir(parents=True, exist_ok=True)
+            if (folder / STUDY).exists():
+                self._check()
+            else:
+                write_atomically(folder / STUDY, json.dumps(asdict(identity), indent=1).encode())
+
+    def __contains__(self, seed: int) -> bool:
+        return self._file(seed).exists()
+
+    def add(self, record: RunRecord) -> None:
+        """Stores a record. Raises CalibrationError if the worker ran another icalib, or the file cannot be written."""
+        check_worker(record.program, self.identity.program)
+        write_atomically(self._file(record.seed), to_json(record))
+
+    def read(self, seed: int) -> RunRecord:
+        """The stored record of a seed. Raises CalibrationError if its file is damaged or missing."""
+        path = self._file(seed)
+        try:
+            return from_json(path.read_bytes())
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path} is damaged; delete it to make the run again.") from error
+
+    def _file(self, seed: int) -> Path:
+        return self.folder / RUNS / f"{seed:06d}.json"
+
+    def _check(self) -> None:
+        path = self.folder / STUDY
+        try:
+            identity = json.loads(path.read_bytes())
+            changed = [words for name, words in _CHANGED.items() if identity[name] != getattr(self.identity, name)]
+        except (ValueError, KeyError, TypeError) as error:
+            raise CalibrationError(f"{path} is damaged; choose another folder.") from error
+        if changed:
+            why = ", ".join(changed)
+            raise CalibrationError(
+                f"{self.folder} holds runs of another study ({why}); choose another folder, or delete it."
+            )

@@ -16,15 +16,13 @@ import numpy as np
 
 from icalib.base.extras import load_matplotlib
 from icalib.base.files import refuse_foreign, sealed
-from icalib.report.page import plot_place
-from icalib.report.plot import COLORS, Figure, axis, figure, line
-from icalib.report.tables import Html, element
-from icalib.sensors.parameter_spec import display_unit
+from icalib.report.figures import COLORS, Figure, axis, figure, line
+from icalib.report.page import Html, element, plot_place
+from icalib.sensors.parameter import display_unit
 from icalib.tools.batch import write_atomically
-from icalib.tools.montecarlo.page import blocks_table, failures, page
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.study import Study, StudyPlan, run_study, scenario_digest
-from icalib.tools.montecarlo.summary import answer, failures_words, largest_words
+from icalib.tools.montecarlo.summary import answer, blocks_table, failures, failures_words, largest_words, page
 from icalib.tools.simulation import load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}

@@ -11,15 +11,31 @@ from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
 from icalib.base.files import printable, refuse_foreign, sealed
 from icalib.errors import CalibrationError
 from icalib.tools.batch import Crew, FailedTask, exclusive_lock, write_atomically
 from icalib.tools.batch import run_all as run_tasks
-from icalib.tools.montecarlo.one_run import GuessKind, PlanesKind, RunTask, run
-from icalib.tools.montecarlo.page import study_html
-from icalib.tools.montecarlo.record import RunRecord
-from icalib.tools.montecarlo.store import Identity, RunStore
-from icalib.tools.montecarlo.summary import Consistency, consistency_json, summarise
+from icalib.tools.montecarlo.record import GuessKind, Identity, PlanesKind, RunRecord, RunStore, RunTask, run
+from icalib.tools.montecarlo.summary import (
+    HEADERS,
+    NUMBERS,
+    Consistency,
+    answer,
+    block_row,
+    consistency_json,
+    failures_words,
+    largest_words,
+    nees_cells,
+    study_html,
+    summarise,
+    unobservable_words,
+)
 from icalib.tools.simulation import Drive, Scenario, load_scenario
 
 Progress = Callable[[str, float], None]
@@ -129,3 +145,52 @@ def run_all(
     empty `program`. Raises the errors of `icalib.tools.batch.run_all`."""
     for task, record in run_tasks(run, tasks, Crew(workers, scheduler)):
         yield RunRecord(task.seed, record.sentence, 0.0, "") if isinstance(record, FailedTask) else record
+
+
+# Prints the summary of a study on the terminal.
+
+MOST_FAILURES = 10  # that are printed
+IN_TWO_LINES = ("mean sigma", "sampled / predicted")  # headers that may wrap
+
+
+def print_study(study: Study, folder: Path) -> None:
+    """Prints the table of blocks, failed runs, and the paths of the files on standard output."""
+    console, consistency = Console(), study.consistency
+    console.print(table(consistency))
+    for line in (answer(consistency), largest_words(consistency), *_failures(consistency), *_unobservable(consistency)):
+        console.print(line, markup=False)
+    seconds = [r.seconds for r in study.records]
+    console.print(f"A run took {np.median(seconds):.1f} s (median).", markup=False)
+    console.print(f"Wrote {folder / 'consistency.json'}, consistency.html.", markup=False)
+
+
+def table(consistency: Consistency) -> Table:
+    """One row for each block, and one for all together; a NEES outside its bounds is red. The table fits into 80
+    columns of text."""
+    out = Table(
+        title="Consistency", title_justify="left", caption_justify="left", box=SIMPLE_HEAD, padding=0, show_edge=False
+    )
+    out.caption = "NEES: per degree of freedom, 1 for a consistent covariance. Undetermined entries are excluded."
+    for header in HEADERS:
+        justify = "right" if header in NUMBERS else "left"
+        out.add_column(header, justify=justify, no_wrap=header not in IN_TWO_LINES, overflow="fold")
+    for block in consistency.blocks:
+        cells = [Text(cell) for cell in block_row(block)]
+        if block.nees is not None:
+            cells[3].stylize("green" if block.nees.consistent else "bold red")
+        out.add_row(*cells)
+    if consistency.whole is not None:
+        out.add_section()
+        out.add_row("all together", "", "", *nees_cells(consistency.whole))
+    return out
+
+
+def _failures(consistency: Consistency) -> list[str]:
+    lines = [failures_words(consistency)]
+    lines += [f"  seed {f.seed}: {f.sentence}" for f in consistency.failures[:MOST_FAILURES]]
+    more = len(consistency.failures) - MOST_FAILURES
+    return lines + ([f"  and {more} more, in consistency.json"] if more > 0 else [])
+
+
+def _unobservable(consistency: Consistency) -> list[str]:
+    return [f"Unobservable in {line}" for line in unobservable_words(consistency)]

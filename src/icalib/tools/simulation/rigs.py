@@ -13,9 +13,9 @@ from icalib.geometry.targets import NoTarget
 from icalib.rig import BY_CLASS, TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.sensor import Sampling, mounted
-from icalib.tools.simulation.scenario.scenario import GRAVITY_WORLD, Scenario, SimCamera
-from icalib.tools.simulation.sensors.imu import rotation_from_vector
-from icalib.tools.simulation.sensors.simulate import raw_time_offset, true_values
+from icalib.tools.simulation.motion import rotation_from_vector
+from icalib.tools.simulation.recording import raw_time_offset, true_values
+from icalib.tools.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
 _HEADER = "# Rig file of a simulated recording: sensors, noise and target, without any value that is estimated.\n"

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
+import yaml
 
-from icalib.base.files import below
-from icalib.errors import RecordingError
-from icalib.tools.simulation.images.filming import Film, Shot
-from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package
+from icalib.base.files import below, staged, write_new, write_text
+from icalib.data.measurements import CornerStream, ImuStream, TrackStream
+from icalib.errors import RecordingError, RigError
+from icalib.tools.simulation.filming import Film, Shot
+from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package, write_table
+from icalib.tools.simulation.recording import Simulation, Truth
+from icalib.tools.simulation.rendering import Imaging
+from icalib.tools.simulation.rigs import rig_text
+from icalib.tools.simulation.scenario import BagTopic, Scenario
 
 Form = BagForm | Literal["euroc"]
 FORMS: tuple[Form, ...] = ("ros1", "mcap", "sqlite3", "euroc")
@@ -110,3 +117,194 @@ class _Folder:
 
 def _image_topic(camera: str) -> str:
     return f"/{camera}/image_raw"
+
+
+# Writes a simulated recording as a folder of tables with its truth; the format is described in docs/simulation.md.
+
+_TRUTH_HEADER = """\
+# Truth of a simulated recording, in SI units: p_imu = T_imu_sensor p_sensor, t_imu = t_sensor + time_offset.
+# Planes: [nx, ny, nz, d] in the world, n . p = d. The trajectory and the points of the tracks are in truth.npz.
+"""
+
+
+def check_absent(path: Path) -> None:
+    """Raises RecordingError if `path` exists, as recordings are never overwritten."""
+    if path.exists():
+        raise RecordingError(f"{path} exists already; remove it, or choose another path.")
+
+
+@contextmanager
+def atomic_output(path: Path) -> Iterator[Path]:
+    """Context with a temporary path beside `path`. It is renamed to `path` at the end, and removed if anything fails.
+
+    Raises RecordingError if `path` exists or cannot be written.
+    """
+    check_absent(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with staged(path.parent) as place:
+            yield place / path.name
+            check_absent(path)
+            (place / path.name).rename(path)
+    except OSError as error:
+        raise RecordingError(f"{path} cannot be written ({error.strerror or error}); choose another folder.") from None
+
+
+def write_tables(
+    simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
+) -> tuple[str, ...]:
+    """Writes the measurements as tables, their truth, and their rig file, to the new folder `path`, atomically.
+
+    Returns an empty tuple, as nothing is left out, see `write_sensors`. Raises RecordingError if `path` exists or
+    cannot be written, CalibrationError if a sensor's name is no valid folder name.
+    """
+    measured = simulation.measurements
+    assert measured.imu is not None  # of every scenario
+    with atomic_output(path) as folder:
+        steps: list[Callable[[], None]] = [partial(_write_imu, below(folder, measured.imu.name), measured.imu)]
+        steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
+        steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]
+        for sensor in simulation.scenario.sensors:
+            steps.append(partial(sensor.write_table, below(folder, sensor.name), measured.streams[sensor.name]))
+        steps += [partial(write_truth, simulation, seed, folder)]
+        for i, step in enumerate(steps):
+            step()
+            progress((i + 1) / len(steps))
+    return ()
+
+
+def write_truth(simulation: Simulation, seed: int, folder: Path, topics: Iterable[str] | None = None) -> None:
+    """Writes truth.yaml, truth.npz and rig.yaml to the existing folder `folder`. topics: see `rig_text`."""
+    write_text(folder / "rig.yaml", rig_text(simulation.scenario, topics))
+    truth = simulation.truth
+    text = yaml.safe_dump(_plain_truth(simulation.scenario, truth, seed), sort_keys=False, default_flow_style=None)
+    (folder / "truth.yaml").write_text(_TRUTH_HEADER + text, encoding="utf-8")
+    trajectory = {name: getattr(truth, name) for name in ("position", "velocity", "gyro_bias", "accel_bias", "points")}
+    stamps_ns = truth.imu_clock_origin_ns + np.round(truth.seconds * 1e9).astype(np.int64)
+    np.savez(folder / "truth.npz", stamps_ns=stamps_ns, rotation=truth.R_world_imu, **trajectory)
+
+
+def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
+    sensors: dict[str, Any] = {
+        "imu0": {
+            "type": "imu",
+            "gyro_bias": truth.gyro_bias[0].tolist(),
+            "accel_bias": truth.accel_bias[0].tolist(),
+            "intrinsics": truth.imu_intrinsics.tolist(),
+        }
+    }
+    for c in scenario.cameras:
+        parameters = {"intrinsics": list(map(float, c.intrinsics)), "distortion": list(map(float, c.distortion))}
+        sensors[c.name] = _mounted(truth, c.name, "camera") | {"model": c.model} | parameters
+    for s in scenario.sensors:
+        sensors[s.name] = _mounted(truth, s.name, s.sensor_type) | s.plain()
+    plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
+    if scenario.board:
+        plain |= {"T_world_bodies": truth.T_world_bodies.tolist(), "target_size": truth.target_size}
+    return plain | {"planes": truth.planes.tolist()}
+
+
+def _mounted(truth: Truth, name: str, kind: str) -> dict[str, Any]:
+    return {
+        "type": kind,
+        "T_imu_sensor": truth.T_imu_sensor[name].tolist(),
+        "time_offset": float(truth.time_offset[name]),
+    }
+
+
+def _write_imu(folder: Path, imu: ImuStream) -> None:
+    header = "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
+    write_table(folder / "data.csv", header, imu.stamps_ns, imu.gyro, imu.accel)
+
+
+def _write_corners(folder: Path, corners: CornerStream, scenario: Scenario) -> None:
+    names = scenario.target.point_identity(corners.point)
+    stamps = corners.stamps_ns[corners.image]
+    write_table(folder / "corners.csv", "t [ns],tag id,corner,u [px],v [px]", stamps, *names, corners.uv)
+
+
+def _write_tracks(folder: Path, tracks: TrackStream) -> None:
+    stamps = tracks.stamps_ns[tracks.image]
+    write_table(folder / "tracks.csv", "t [ns],feature,u [px],v [px]", stamps, tracks.feature, tracks.uv)
+
+
+# Writes a simulated recording as a bag with the messages of the sensors' drivers: ROS 1, or MCAP of ROS 2.
+
+Event = tuple[int, str, Callable[[BagWriter], Any]]  # instant on the IMU's clock [ns], topic, maker of the message
+_EXPOSURE_S = 0.004
+_AT_A_TIME = 10_000  # readings that are converted to Python numbers at once, which take ten times the memory
+
+
+def write_sensors(
+    simulation: Simulation, seed: int, path: Path, progress: Callable[[float], None] = lambda done: None
+) -> tuple[str, ...]:
+    """Writes an MCAP bag, its truth and its rig file to the new folder `path`, atomically. If `path` ends with .bag,
+    it is a ROS 1 bag, with only the rig file beside it, as `run.rig.yaml`.
+
+    Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
+    or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
+    exists or cannot be written, CalibrationError if a package is missing, RigError for a board that is not flat.
+    """
+    if any(simulation.scenario.bow):
+        raise RigError("boards are rendered flat; set the scenario's bow to zero.")
+    ros1, rig = path.suffix == ".bag", path.with_suffix(".rig.yaml")
+    if ros1:
+        check_absent(rig)
+    topics, streams, notes = _streams(simulation, seed)
+    last_ns = simulation.truth.imu_clock_origin_ns + int(simulation.truth.seconds[-1] * 1e9)
+    span_ns = max(last_ns - simulation.truth.imu_clock_origin_ns, 1)
+    with atomic_output(path) as place:
+        with BagWriter("ros1" if ros1 else "mcap", place, topics) as bag:
+            for at_ns, topic, make in heapq.merge(*streams, key=lambda event: event[0]):
+                bag.write(topic, make(bag), at_ns)
+                progress(1.0 - (last_ns - at_ns) / span_ns)
+        if not ros1:
+            write_truth(simulation, seed, place, topics)
+    if ros1:
+        write_new(rig, rig_text(simulation.scenario, topics))
+        notes += (f"the rig file of the bag is {rig}.",)
+    return notes
+
+
+def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[Iterator[Event]], tuple[str, ...]]:
+    """The message type of each topic, the events of each stream, and sentences on sensors without messages."""
+    measured, truth = simulation.measurements, simulation.truth
+    assert measured.imu is not None  # of every scenario
+    topics, streams, notes = {IMU_TOPIC: IMU}, [_readings(measured.imu)], []
+    for sensor in simulation.scenario.sensors:
+        topic = sensor.bag_topic(measured.streams[sensor.name], round(truth.time_offset[sensor.name] * 1e9))
+        if isinstance(topic, str):
+            notes.append(topic)
+            continue
+        topics[topic.name] = topic.message
+        streams.append(_on_topic(topic))
+    if simulation.scenario.board or simulation.scenario.room:
+        topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
+        streams.append(_images(simulation, seed))
+    elif simulation.scenario.cameras:
+        notes.append("images show targets or a room, and the scenario has neither, so no images are written.")
+    return topics, streams, tuple(notes)
+
+
+def _on_topic(topic: BagTopic) -> Iterator[Event]:
+    return ((at_ns, topic.name, make) for at_ns, make in topic.events)
+
+
+def _readings(imu: ImuStream) -> Iterator[Event]:
+    for first in range(0, len(imu.stamps_ns), _AT_A_TIME):
+        some = slice(first, first + _AT_A_TIME)
+        values = np.concatenate([imu.gyro[some], imu.accel[some]], axis=1).tolist()
+        for stamp_ns, row in zip(imu.stamps_ns[some].tolist(), values, strict=True):
+            yield stamp_ns, IMU_TOPIC, lambda bag, stamp_ns=stamp_ns, row=row: bag.imu(stamp_ns, row)
+
+
+def _images(simulation: Simulation, seed: int) -> Iterator[Event]:
+    """Events of all images, which are rendered on all cores, a few of them ahead."""
+    imu, truth = simulation.measurements.imu, simulation.truth
+    assert imu is not None  # of every scenario
+    for shot in Film(simulation.scenario, seed, Imaging(blur_px=0.8, noise=2.0), _EXPOSURE_S, imu, truth).shots():
+        yield (
+            truth.imu_clock_origin_ns + round(shot.seconds * 1e9),
+            f"/{shot.camera}/image_raw",
+            lambda bag, shot=shot: bag.image(shot.stamp_ns, shot.camera, shot.pixels),
+        )

@@ -22,17 +22,13 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.steps.contradicted_guesses import merged_translation, merged_value
-from icalib.initialize.steps.gyro_rotation import GyroRotation
-from icalib.initialize.steps.lever_arm import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
-from icalib.initialize.steps.rate_alignment import RateAlignment
+from icalib.initialize.hand_eye import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
+from icalib.initialize.initializer import merged_translation, merged_value
+from icalib.initialize.rate_alignment import RateAlignment
+from icalib.initialize.rate_correlation import GyroRotation
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.optim.state import Key
 from icalib.rig import Axes, Camera, ImuSensor, Rig
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict, taken_at_once
-from icalib.sensors.camera.initialize.boards.scene_intrinsics import find_scene, intrinsics_of
-from icalib.sensors.camera.initialize.boards.target_poses import TargetPoses, camera_rates
-from icalib.sensors.camera.initialize.boards.target_scene import TargetScene, scene_poses
 from icalib.sensors.camera.initialize.guess import (
     CameraGuess,
     Guess,
@@ -41,6 +37,10 @@ from icalib.sensors.camera.initialize.guess import (
     known_value,
     relative_offset,
 )
+from icalib.sensors.camera.initialize.scene_intrinsics import find_scene, intrinsics_of
+from icalib.sensors.camera.initialize.target_poses import TargetPoses, camera_rates
+from icalib.sensors.camera.initialize.target_scene import TargetScene, scene_poses
+from icalib.sensors.camera.model import choose_bodies, restrict, taken_at_once
 from icalib.sensors.sensor import ROTATION
 
 __all__ = ["CameraGuess", "Guess", "initial_guess", "initial_trajectory"]

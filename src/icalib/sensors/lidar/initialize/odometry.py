@@ -21,7 +21,7 @@ from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.small import mul3, solve_definite, tmul3
-from icalib.initialize.trajectories.trajectory_fit import SensorTrajectory
+from icalib.initialize.trajectories import SensorTrajectory
 from icalib.optim.arrowhead import N_THREADS
 from icalib.sensors.lidar.initialize.voxel_map import (
     N_SCAN_UNKNOWNS,

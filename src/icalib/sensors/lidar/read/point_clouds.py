@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import struct
+from collections import Counter, namedtuple
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -13,12 +14,23 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream
 from icalib.data.messages import HasMessages
+from icalib.data.stamps import rate_sentence
 from icalib.errors import RecordingError
 from icalib.rig import Lidar, TimeUnit
-from icalib.sensors.lidar.read.azimuth_times import SweepOrder, find_sweep, sweep_share
-from icalib.sensors.lidar.read.checks import Sieve
-from icalib.sensors.lidar.read.livox import LivoxCloud
-from icalib.sensors.lidar.read.point_times import PointTimes, clock_note, find_point_times, likely_fields
+from icalib.sensors.lidar.read.point_times import (
+    PointTimes,
+    SweepOrder,
+    at_even_steps,
+    clock_note,
+    find_point_times,
+    find_sweep,
+    in_order,
+    likely_fields,
+    selected,
+    sweep_share,
+    with_even_stamps,
+    without_repeats,
+)
 
 _N_TIMING_CLOUDS = 8  # first clouds with points, from which field and unit of point times are found
 
@@ -252,3 +264,174 @@ def _point_type(message: Any) -> np.dtype:
             "itemsize": message.point_step,
         }
     )
+
+
+# Checks of points and scans: usable points, and stamps that fit the point times.
+
+_SCAN_RATE_HZ = (0.1, 1000.0)  # lowest and highest plausible rate
+_MAX_POINT_PERIODS = 2.0  # time from the stamp of a scan to its points, in scan periods
+_MAX_FAR_SHARE = 0.1  # of the scans; if more exceed _MAX_POINT_PERIODS, unit or origin of point times is wrong
+_POINTS_PER_BATCH = 1_000_000  # bounds the memory
+
+
+class Sieve:
+    """Selects finite points with a time, from min_range_m to max_range_m, and counts all other points by reason."""
+
+    def __init__(self, min_range_m: float, max_range_m: float) -> None:
+        self._near_m, self._far_m = min_range_m, max_range_m
+        self._total = 0
+        self._dropped = np.zeros(5, np.int64)
+
+    def keep(self, xyz: np.ndarray, offset_s: np.ndarray) -> np.ndarray:
+        """(N,) bool: the point xyz (N, 3) [m] can be used. offset_s (N,): its time, NaN if it has none."""
+        with np.errstate(over="ignore", invalid="ignore"):  # squares of huge values overflow to infinity
+            r2 = np.einsum("ij,ij->i", xyz, xyz)
+        near, far = r2 < np.float32(self._near_m) ** 2, r2 > np.float32(self._far_m) ** 2
+        good, timed = np.isfinite(r2), np.isfinite(offset_s)
+        kept = good & timed & ~near & ~far
+        self._total += len(r2)
+        if not kept.all():
+            zero = r2 == 0
+            reasons = (~good, good & zero, good & near & ~zero, good & far, good & ~near & ~far & ~timed)
+            self._dropped += [np.count_nonzero(reason) for reason in reasons]
+        return kept
+
+    def note(self, what: str) -> str | None:
+        """A sentence on the points left out of `what`, by reason; None if all were kept."""
+        if not self._dropped.any():
+            return None
+        words = (
+            "without numbers",
+            "at zero",
+            f"nearer than {self._near_m:g} m",
+            f"farther than {self._far_m:g} m",
+            "without a time within their scan",
+        )
+        parts = [f"{count} {why}" for count, why in zip(self._dropped, words, strict=True) if count]
+        return f"{what}: of {self._total} points {', '.join(parts)} were left out."
+
+
+def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
+    """The stream with the points that the sieve keeps; a scan may become empty. Reuses the arrays of `stream`, which
+    are invalid afterwards, as a second cloud may not fit in memory."""
+    n = len(stream.xyz)
+    columns = (stream.offset_s, stream.xyz, stream.plane)
+    keep = np.empty(n, bool)
+    kept = 0
+    for begin in range(0, n, _POINTS_PER_BATCH):
+        part = slice(begin, min(begin + _POINTS_PER_BATCH, n))
+        keep[part] = sieve.keep(stream.xyz[part], stream.offset_s[part])
+        count = int(np.count_nonzero(keep[part]))
+        for column in columns:
+            column[kept : kept + count] = column[part][keep[part]]
+        kept += count
+    start = stream.start - np.searchsorted(np.flatnonzero(~keep), stream.start)
+    return LidarStream(stream.name, stream.stamps_ns, start, *(column[:kept] for column in columns))
+
+
+def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """`stream` without scans that are empty, repeat a recent scan, or have a wrong stamp; and notes on these.
+
+    Raises RecordingError naming `where` and the instant: fewer than two scans with points, a clock that was set back,
+    an implausible rate, or points far from the stamp of their scan.
+    """
+    what = f"{where} ({stream.name})"
+    filled = np.diff(stream.start) > 0
+    if filled.sum() < 2:
+        raise RecordingError(
+            f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the "
+            "whole recording. Check the driver, and min_range and max_range in the rig file."
+        )
+    notes = ()
+    if not filled.all():
+        notes = (f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out.",)
+        start = np.append(stream.start[:-1][filled], stream.start[-1])
+        stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
+    for check in (without_repeats, in_order, with_even_stamps, at_even_steps):
+        stream, more = check(stream, what)
+        notes += more
+    if len(stream.stamps_ns) < 2:
+        raise RecordingError(
+            f"{what}: all scans are the same; the LiDAR or its driver froze; restart it, and record again."
+        )
+    sentence = rate_sentence(what, stream.stamps_ns, *_SCAN_RATE_HZ)
+    if sentence:
+        raise RecordingError(sentence)
+    stream, more = _near_their_stamps(stream, what)
+    return stream, notes + more
+
+
+def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+    """The stream without scans whose points are far in time from the stamp, and a note. Raises RecordingError if there
+    are many such scans."""
+    period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
+    low, high = (extreme.reduceat(stream.offset_s, stream.start[:-1]) for extreme in (np.minimum, np.maximum))
+    far = np.maximum(-low, high) > _MAX_POINT_PERIODS * period_s
+    if not far.any():
+        return stream, ()
+    if far.mean() > _MAX_FAR_SHARE:
+        raise RecordingError(
+            f"{what}: points are {low[far].min():.4g} to {high[far].max():.4g} s from the stamp of their scan, "
+            f"but scans are {period_s:.4g} s apart; write point times relative to the stamp of the scan."
+        )
+    first = stream.stamps_ns[np.argmax(far)]
+    note = (
+        f"{what}: {int(far.sum())} of {len(far)} scans have points that are far from their stamp and were left out, "
+        f"the first at {first} ns."
+    )
+    return selected(stream, np.flatnonzero(~far)), (note,)
+
+
+# Parser of the point message of Livox: CustomMsg of livox_ros_driver, livox_ros_driver2 and livox_ros2_driver.
+#
+# Its definition, which ROS does not include:
+#
+# Header header; uint64 timebase; uint32 point_num; uint8 lidar_id; uint8[3] rsvd; CustomPoint[] points CustomPoint:
+# uint32 offset_time [ns]; float32 x, y, z [m]; uint8 reflectivity, tag, line
+
+LIVOX_TYPES = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg", "livox_interfaces/msg/CustomMsg")
+_POINT_FIELDS = {"offset_time": "u4", "x": "f4", "y": "f4", "z": "f4", "reflectivity": "u1", "tag": "u1", "line": "u1"}
+_POINT_BYTES = 19  # size of a point; in CDR padded to a multiple of 4
+
+
+# Stamp [s, ns since 1970] and header of a message, with the field names of ROS.
+Stamp, Header = namedtuple("Stamp", "sec nanosec"), namedtuple("Header", "stamp frame_id")
+
+
+@dataclass(frozen=True)
+class LivoxCloud:
+    """A CustomMsg. points (N,): structured array with the fields of CustomPoint."""
+
+    header: Header
+    points: np.ndarray
+
+
+def parse_ros1(content: bytes) -> LivoxCloud:
+    """Parses a message in ROS 1 serialisation. Raises ValueError or struct.error if the bytes are no such message."""
+    _, sec, nanosec, length = struct.unpack_from("<4I", content)
+    at = 16 + length
+    header = Header(Stamp(sec, nanosec), content[16:at].decode("utf-8", "replace"))
+    return LivoxCloud(header, _points(content, at + 16, "<", _POINT_BYTES))
+
+
+def parse_cdr(content: bytes) -> LivoxCloud:
+    """Parses a message in CDR (ROS 2). Raises ValueError or struct.error if the bytes are no such message."""
+    body = content[4:]  # alignment counts from here
+    order = "<" if content[1:2] == b"\x01" else ">"
+    sec, nanosec, length = struct.unpack_from(order + "iII", body)
+    name = body[12 : 12 + length].rstrip(b"\0").decode("utf-8", "replace")
+    timebase = -(-(12 + length) // 8) * 8
+    return LivoxCloud(Header(Stamp(sec, nanosec), name), _points(body, timebase + 16, order, -(-_POINT_BYTES // 4) * 4))
+
+
+def _points(content: bytes, at: int, order: str, step: int) -> np.ndarray:
+    """Points (N,), structured. N is stored at byte `at`; the points follow, `step` bytes each. order: byte order."""
+    (count,) = struct.unpack_from(order + "I", content, at)
+    size = step * count - (step - _POINT_BYTES) * (count > 0)
+    data = content[at + 4 : at + 4 + size]
+    if len(data) < size:
+        raise ValueError(f"{count} points do not fit {len(content)} bytes")
+    offsets = np.cumsum([0, *(np.dtype(kind).itemsize for kind in _POINT_FIELDS.values())])[:-1].tolist()
+    kinds = [order + kind for kind in _POINT_FIELDS.values()]
+    dtype = np.dtype({"names": list(_POINT_FIELDS), "formats": kinds, "offsets": offsets, "itemsize": step})
+    return np.frombuffer(data + bytes(step * count - size), dtype)

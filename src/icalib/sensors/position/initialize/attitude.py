@@ -23,11 +23,11 @@ from functools import cached_property
 import numpy as np
 
 from icalib.geometry import so3
-from icalib.geometry.integrals import once_integrated, twice_integrated
-from icalib.initialize.steps.lever_arm import Triples
-from icalib.initialize.steps.rate_correlation import CorrelationPeak, best_shifts
+from icalib.geometry.small import once_integrated, twice_integrated
+from icalib.initialize.hand_eye import Triples
+from icalib.initialize.rate_correlation import CorrelationPeak, best_shifts
 from icalib.motion.imu_data import ImuData, clear_of
-from icalib.sensors.position.read.outliers import steps
+from icalib.sensors.position.read import steps
 
 MAX_WINDOW_ROUNDS = 12
 # rad, rad/s, m/s^2, m, s: of a Gauss-Newton step. Smaller changes of a start value do not change the estimate.

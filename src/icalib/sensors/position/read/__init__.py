@@ -11,20 +11,26 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import median_filter
 
-from icalib.data.images.image_checks import Note, ignore
-from icalib.data.recordings.base import Reading, ReadStream, Recording
-from icalib.data.stamps.ordered import kept_readings, true_runs
-from icalib.data.tables.table import TableFile, named
-from icalib.data.topics import TopicInfo
+from icalib.data.images import Note, ignore
+from icalib.data.messages import TopicInfo
+from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.stamps import kept_readings, true_runs
+from icalib.data.tables import TableFile, named
 from icalib.errors import RecordingError
 from icalib.geometry.geodesy import east_north_up, latitude_longitude
-from icalib.sensors.position.read.fixes import FIX_TYPES, NAVSAT, POINT, RECEIVER, SENTENCE, is_nmea, read_nmea
-from icalib.sensors.position.read.outliers import single_wrong, steps
-from icalib.sensors.position.read.readings import (
+from icalib.geometry.small import lagrange_weights
+from icalib.sensors.position.read.fixes import (
     AS_RECORDED,
     FIX_RATES_HZ,
+    FIX_TYPES,
     GEODETIC,
+    NAVSAT,
+    POINT,
+    RECEIVER,
+    SENTENCE,
+    SUFFIX,
     LocalFrame,
     PositionReadings,
     Recorded,
@@ -32,10 +38,12 @@ from icalib.sensors.position.read.readings import (
     from_fixes,
     from_geodetic,
     good_fixes,
+    is_nmea,
     left_out,
+    read_nmea,
+    read_pos,
     read_position_table,
 )
-from icalib.sensors.position.read.rtklib import SUFFIX, read_pos
 from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TableLayout
@@ -263,3 +271,59 @@ def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
         "when a receiver gains or loses its carrier-phase solution. Fixes that do not fit the trajectory are rejected; "
         "leave worse fixes out with least_status, or cut the recording with --from and --to.",
     )
+
+
+# Outliers among fixes before estimation: single fixes off the path of their neighbours, and lasting steps of the
+# receiver's solution.
+
+MEDIAN_WINDOW_FIXES = 51  # of the moving median of distances, as motion and noise change
+MAX_MEDIAN_DISTANCES = 8.0  # an outlier is this many median distances off, some 10 standard deviations
+MIN_OUTLIER_M = 0.05  # smaller errors are no outliers, even among fixes without noise
+MAX_OUTLIER_SHARE = 0.1  # of all fixes: if more look like outliers, none of them is rejected
+MAX_GAP_STEPS = 2.5  # median intervals: a longer one is a gap, over which the motion may change
+# The cubic through two fixes on each side weighs a neighbour by 2/3. An outlier thus moves the distances of both its
+# neighbours by 2/3 of its size. A step that lasts moves that of one of them by its whole size.
+NEIGHBOUR_SHARES = 0.35, 0.9
+# A step of the solution is larger than this, and than a motion with this acceleration makes within an interval.
+MIN_STEP_M, MIN_STEP_M_S2 = 0.3, 10.0
+
+
+def single_wrong(t: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(n,) bool: which fixes p (n, 3) m at t (n,) s are single outliers, by Hampel's identifier on their distances from
+    a cubic through their neighbours (Davies and Gather, 1993)."""
+    n = len(t)
+    wrong = np.zeros(n, dtype=bool)
+    if n < 9:
+        return wrong
+    far = _from_cubic(t, p)
+    typical = np.maximum(median_filter(far, size=min(MEDIAN_WINDOW_FIXES, n), mode="nearest"), np.median(far))
+    limit = np.maximum(MAX_MEDIAN_DISTANCES * typical, MIN_OUTLIER_M)
+    beside = np.stack([np.roll(far, 1), np.roll(far, -1)]) / np.maximum(far, 1e-12)
+    alone = (beside.min(axis=0) > NEIGHBOUR_SHARES[0]) & (beside.max(axis=0) < NEIGHBOUR_SHARES[1])
+    wrong = (far > limit) & alone
+    return wrong if wrong.mean() <= MAX_OUTLIER_SHARE else np.zeros(n, dtype=bool)
+
+
+def _from_cubic(t: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(n,) distances [m] from the cubic through two fixes on each side; 0 at the ends and beside gaps."""
+    n = len(t)
+    i = np.arange(2, n - 2)
+    knots = np.stack([i - 2, i - 1, i + 1, i + 2])
+    predicted = np.einsum("kn,kni->ni", lagrange_weights(t[knots] - t[i]), p[knots])
+    out = np.zeros(n)
+    even = t[i + 2] - t[i - 2] < 4.0 * MAX_GAP_STEPS * np.median(np.diff(t))
+    out[i] = np.where(even, np.linalg.norm(p[i] - predicted, axis=1), 0.0)
+    return out
+
+
+def steps(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Steps of positions p (n, 3) m at t (n,) s that are not motion: numbers (m,) of the first fix after each, and the
+    step vectors (m, 3) m."""
+    dt, moved = np.diff(t), np.diff(p, axis=0)
+    if len(dt) < 5:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    beyond = moved - dt[:, None] * median_filter(moved / dt[:, None], size=(5, 1), mode="nearest")
+    typical, size = float(np.median(dt)), np.linalg.norm(beyond, axis=1)
+    limit = max(MIN_STEP_M, MIN_STEP_M_S2 * typical**2, MAX_MEDIAN_DISTANCES * float(np.median(size)))
+    before = np.flatnonzero((size > limit) & (dt < MAX_GAP_STEPS * typical))
+    return before + 1, beyond[before]

@@ -8,20 +8,23 @@ ublox_ubx_msgs/UBXNavPVT, nmea_msgs/Sentence.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from functools import reduce
 from operator import xor
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from icalib.data.messages import pose_of
-from icalib.data.tables.table import read_bytes
-from icalib.data.topics import MessageType
+from icalib.data.images import Note, ignore
+from icalib.data.messages import MessageType, pose_of
+from icalib.data.tables import STAMP, TableKind, named, places_by_name, read_bytes, read_table
 from icalib.errors import RecordingError
-from icalib.sensors.position.spec import STATUSES
+from icalib.geometry.geodesy import earth_centred, local_metres
+from icalib.sensors.position.spec import STATUSES, PositionSensor, Status
+from icalib.sensors.stream import RawReadings
 
 NAVSAT, POINT, RECEIVER, SENTENCE = "navsat", "point", "receiver", "nmea"  # kinds of topics with positions alone
 NO_FIX, SINGLE, DIFFERENTIAL, FLOAT, FIXED = range(-1, len(STATUSES))
@@ -49,14 +52,14 @@ def _metric(m: Any) -> RecordedFix:
 
 # NavSatStatus: 0 fix, 1 satellite-based, 2 ground-based augmentation (where receivers report RTK). GPSStatus has these
 # and 18 differential, 19 RTK fixed, 20 RTK float, 33 WAAS.
-_STATUS = {0: SINGLE, 1: DIFFERENTIAL, 2: FIXED, 18: DIFFERENTIAL, 19: FIXED, 20: FLOAT, 33: DIFFERENTIAL}
+_STATUS_OF_NAVSAT = {0: SINGLE, 1: DIFFERENTIAL, 2: FIXED, 18: DIFFERENTIAL, 19: FIXED, 20: FLOAT, 33: DIFFERENTIAL}
 
 
 def _satellites(m: Any) -> RecordedFix:
     """The fix of NavSatFix, or of GPSFix, whose errors are bounds of 95 %, 1.96 standard deviations; 0: unknown."""
     bounds = getattr(m, "errors", np.zeros(3))[[1, 1, 2]]
     covariance = m.position_covariance.reshape(3, 3) if m.position_covariance_type else np.diag((bounds / 1.96) ** 2)
-    status = _STATUS.get(getattr(m.status, "status", m.status), NO_FIX)
+    status = _STATUS_OF_NAVSAT.get(getattr(m.status, "status", m.status), NO_FIX)
     return RecordedFix((m.latitude, m.longitude, m.altitude), covariance, status)
 
 
@@ -170,3 +173,303 @@ FIX_TYPES = {
     name: (MessageType(name, kind, fix_of is not _nav_pvt, definition=fields.replace(", ", "\n")), fix_of)
     for name, kind, fix_of, fields in _DECLARED
 }
+
+
+# Solutions of RTKLIB: text files `.pos`.
+#
+# Source: RTKLIB 2.4.3 manual, appendix B.1 "Positioning solution file", and `outsolhead` and `outpos` of its
+# solution.c.
+
+SUFFIX = ".pos"
+_GPS_START = datetime(1980, 1, 6, tzinfo=UTC)
+# Q of the file: 1 fixed, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; 0: none.
+_STATUS_OF_RTKLIB = {1: "fixed", 2: "float", 3: "differential", 4: "differential", 5: "single", 6: "float"}
+_SIGMAS = {
+    "geodetic": ("sdn", "sde", "sdu", "sdne", "sdeu", "sdun"),
+    "earth": ("sdx", "sdy", "sdz", "sdxy", "sdyz", "sdzx"),
+    "local": ("sde", "sdn", "sdu", "sden", "sdnu", "sdue"),
+}
+_EPOCH_NS = 1_000_000_000
+
+
+def read_pos(name: str, path: Path) -> tuple[PositionReadings, Recorded]:
+    """The solutions in a `.pos` file, which may be gzipped, and their coordinates. Stamps are in its scale of time,
+    GPST or UTC, from 1970 on without leap seconds. Raises RecordingError naming file and line."""
+    lines = read_bytes(path).decode("utf-8", "replace").splitlines()
+    header = next((line for line in reversed(lines) if line.startswith("%") and "Q" in line.split()), "")
+    names = [name.split("(")[0] for name in header.lstrip("% ").replace(",", " ").split()]
+    kind = _kind(path, header, names)
+    rows = [(k, line) for k, line in enumerate(lines, 1) if line.strip() and not line.startswith("%")]
+    if not rows:
+        raise RecordingError(f"{path} holds no solutions; run the positioning again.")
+    fields = [(k, line.replace(",", " ").split()) for k, line in rows]
+    sexagesimal = "(d'\")" in header
+    stamps_ns, numbers = [], []
+    for k, row in fields:
+        try:
+            stamps_ns.append(_stamp_ns(row[0], row[1]))
+            values = [float(x) for x in row[2:]]
+            numbers.append(_in_degrees(values) if sexagesimal else values)
+        except (ValueError, IndexError) as error:
+            raise RecordingError(f"{path}:{k}: the line is not a solution of RTKLIB; correct or remove it.") from error
+    width = min(len(row) for row in numbers)
+    table, columns = np.array([row[:width] for row in numbers]), names[1:]
+    quality = table[:, columns.index("Q")].astype(int)
+    index = {q: STATUSES.index(status) for q, status in _STATUS_OF_RTKLIB.items()}
+    status = np.array([index.get(int(q), -1) for q in quality])
+    covariance = _covariance(table, columns, kind)
+    return PositionReadings(name, np.array(stamps_ns, np.int64), table[:, :3], covariance, status), kind
+
+
+def _kind(path: Path, header: str, names: list[str]) -> Recorded:
+    kinds: dict[str, Recorded] = {"latitude": "geodetic", "x-ecef": "earth", "e-baseline": "local"}
+    if len(names) > 4 and names[1] in kinds:
+        return kinds[names[1]]
+    words = header.strip() or "there is no line that starts with % and names the columns"
+    raise RecordingError(
+        f"{path}: the header does not name the columns of an RTKLIB solution ({words:.80}); write the file with its "
+        "header, with latitude, longitude and height, or x, y and z."
+    )
+
+
+def _stamp_ns(first: str, second: str) -> int:
+    """Nanoseconds since 1970 of the first two columns: date and time, or GPS week and seconds."""
+    if "/" in first:
+        year, month, day = (int(x) for x in first.split("/"))
+        hours, minutes, seconds = second.split(":")
+        integer, _, fraction = seconds.partition(".")
+        at = datetime(year, month, day, tzinfo=UTC) + timedelta(
+            hours=int(hours), minutes=int(minutes), seconds=int(integer)
+        )
+    else:
+        integer, _, fraction = second.partition(".")
+        at = _GPS_START + timedelta(weeks=int(first), seconds=int(integer))
+    return round(at.timestamp()) * _EPOCH_NS + int(f"{fraction:0<9.9}")
+
+
+def _in_degrees(values: list[float]) -> list[float]:
+    """The row with latitude and longitude [deg] from three columns each: degrees, minutes, seconds."""
+    angles = []
+    for k in (0, 3):
+        degrees, minutes, seconds = values[k : k + 3]
+        sign = -1.0 if np.copysign(1.0, degrees) < 0.0 else 1.0
+        angles.append(sign * (abs(degrees) + minutes / 60.0 + seconds / 3600.0))
+    return [*angles, *values[6:]]
+
+
+def _covariance(table: np.ndarray, columns: list[str], kind: str) -> np.ndarray:
+    """(N, 3, 3) m^2 in axes east, north and up, or x, y and z; (0, 3, 3) where the file has none. Off the diagonal the
+    file has the signed root of the absolute covariance."""
+    names = _SIGMAS[kind]
+    if any(name not in columns or columns.index(name) >= table.shape[1] for name in names[:3]):
+        return np.zeros((0, 3, 3))
+    sigmas = [
+        table[:, columns.index(n)] if n in columns and columns.index(n) < table.shape[1] else np.zeros(len(table))
+        for n in names
+    ]
+    a, b, c = (x**2 for x in sigmas[:3])
+    ab, bc, ca = (np.copysign(x**2, x) for x in sigmas[3:])
+    if kind == "geodetic":  # north, east, up
+        a, b, ab, bc, ca = b, a, ab, ca, bc
+    rows = np.stack([a, ab, ca, ab, b, bc, ca, bc, c], axis=1).reshape(-1, 3, 3)
+    return usable_covariances(rows, np.ones(len(rows), bool))
+
+
+# Fixes as recorded, and as positions in metres relative to the first good one.
+#
+# Tables of positions: metric x, y, z, or latitude, longitude and height; with standard deviations where a header names
+# them.
+
+NO_COVARIANCE = np.zeros((0, 3, 3))
+Recorded = Literal["geodetic", "earth", "local"]  # coordinates; latitude, longitude and height; Earth-centred; metric
+MAX_DISTANCE_M = 20_000.0  # from the first fix: the vertical turns by 3 mrad, which is 0.03 m/s^2 of gravity
+
+
+@dataclass(frozen=True)
+class LocalFrame:
+    """A frame relative to the recorded coordinates: origin + axes^T p is the recorded position of p (3,) m. origin (3,)
+    m; axes (3, 3): R_local_recorded; on_earth: the recorded coordinates are Earth-centred, or latitude, longitude and
+    height."""
+
+    origin: np.ndarray
+    axes: np.ndarray
+    on_earth: bool = False
+
+    def moved(self, by: np.ndarray) -> LocalFrame:
+        """This frame with its origin shifted by `by` (3,) m along its axes."""
+        return replace(self, origin=self.origin + by @ self.axes)
+
+
+AS_RECORDED = LocalFrame(np.zeros(3), np.eye(3))
+
+
+@dataclass(frozen=True)
+class PositionReadings(RawReadings):
+    """position (N, 3) m in `frame`, or latitude, longitude [deg] and height [m] until they are converted; covariance
+    (N, 3, 3) m^2, or (0, 3, 3); status (N,) index into `STATUSES`, -1: no fix, or (0,) where none is stated."""
+
+    position: np.ndarray
+    covariance: np.ndarray
+    status: np.ndarray
+    frame: LocalFrame = AS_RECORDED
+
+    def inside(self, what: str, frame: LocalFrame, owner: str) -> PositionReadings:
+        """The readings in the frame of `owner`. Raises RecordingError if only one of the two frames is on the Earth."""
+        if self.frame.on_earth != frame.on_earth:
+            kind = "latitudes and longitudes" if self.frame.on_earth else "positions in metres"
+            raise RecordingError(
+                f"{what}: {kind} cannot be in the frame of {owner}; write frame: levelled in the rig file."
+            )
+        R = frame.axes @ self.frame.axes.T
+        covariance = R @ self.covariance @ R.T if len(self.covariance) else self.covariance
+        position = self.position @ R.T + frame.axes @ (self.frame.origin - frame.origin)
+        return replace(self, position=position, covariance=covariance, frame=frame)
+
+
+def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:
+    """(n,) bool: which of n fixes have at least the status `least`; all of them if status, (n,) or (0,), is empty."""
+    return status >= STATUSES.index(least) if len(status) else np.ones(n, dtype=bool)
+
+
+def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> tuple[str, ...]:
+    """A note on fixes that are not good."""
+    if good.all():
+        return ()
+    none, worse = int((status < 0).sum()), int((~good & (status >= 0)).sum())
+    parts = [f"{none} without a fix"] * (none > 0) + [f"{worse} worse than {least} (least_status)"] * (worse > 0)
+    return (f"{what}: {none + worse} of {len(good)} positions were left out, {' and '.join(parts)}.",)
+
+
+def from_geodetic(what: str, readings: PositionReadings, good: np.ndarray) -> tuple[PositionReadings, tuple[str, ...]]:
+    """Those of `readings` that are `good` (N,) bool, in metres east, north and up of the first, and a note. Covariances
+    are in these axes already, positions latitude and longitude [deg] and height over the WGS84 ellipsoid [m].
+
+    Raises RecordingError where latitudes, longitudes or heights cannot be right.
+    """
+    degrees = readings.position
+    usable = good & np.isfinite(degrees).all(axis=1) & (np.abs(degrees[:, :2]) > 1e-9).any(axis=1)
+    _refuse_heights(what, degrees, good)
+    if not usable.any():
+        raise RecordingError(f"{what}: no position has latitude, longitude and height; record again with a fix.")
+    latitude, longitude, height = degrees.T
+    if (np.abs(latitude[usable]) > 90.0).any():
+        swapped = (np.abs(longitude[usable]) <= 90.0).all()
+        cause = "latitude and longitude are swapped" if swapped else "it is not in degrees"
+        raise RecordingError(
+            f"{what}: the first latitude is {latitude[usable][0]:.6g} degrees, as if {cause}; say which "
+            "column is which by `columns: [...]` in the rig file."
+        )
+    xyz = earth_centred(np.deg2rad(latitude), np.deg2rad(longitude), height)
+    first = int(np.argmax(usable))
+    position, axes = local_metres(xyz, xyz[first])
+    away = float(np.linalg.norm(position[usable], axis=1).max())
+    if away > MAX_DISTANCE_M:
+        raise RecordingError(
+            f"{what}: its fixes are up to {away / 1e3:.0f} km from the first one; the plane of east and north does not "
+            "follow the Earth so far. Cut the recording with --from and --to, or leave out fixes without a solution."
+        )
+    note = (
+        f"{what}: metres are east, north and up of the first fix, latitude {latitude[first]:.8f}, longitude "
+        f"{longitude[first]:.8f}, height {height[first]:.3f} m."
+    )
+    return replace(readings, position=position, frame=LocalFrame(xyz[first], axes, True)).some(usable), (note,)
+
+
+def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
+    height = degrees[good, 2]
+    if len(height) and (~np.isfinite(height)).mean() > 0.5:
+        raise RecordingError(f"{what}: heights are missing (NaN); write the height over the WGS84 ellipsoid in metres.")
+    if len(height) > 2 and (height == 0.0).all():
+        raise RecordingError(
+            f"{what}: all heights are 0, as if they were missing; write the height over the WGS84 ellipsoid in metres."
+        )
+
+
+def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[str, ...]]:
+    """Readings in metres, and a note. If the first position is more than 100 m from the origin of the frame, the origin
+    moves to the first position, rounded to whole metres. Raises RecordingError if no position is finite."""
+    p = readings.position
+    finite = np.isfinite(p).all(axis=1)
+    if not finite.any():
+        raise RecordingError(f"{what}: no position is finite; correct the program that writes them.")
+    origin = np.round(p[int(np.argmax(finite))])
+    if np.linalg.norm(origin) <= 100.0:
+        return readings, ()
+    x, y, z = origin
+    note = f"{what}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away."
+    return replace(readings, position=p - origin, frame=readings.frame.moved(origin)), (note,)
+
+
+def from_fixes(name: str, stamped: Sequence[tuple[int, RecordedFix]]) -> PositionReadings:
+    """Readings of fixes with their stamps [ns], geodetic ones not yet in metres."""
+    fixes = [fix for _, fix in stamped]
+    position = np.array([fix.position for fix in fixes]).reshape(-1, 3)
+    covariance = np.array([fix.covariance for fix in fixes]).reshape(-1, 3, 3)
+    status = np.array([fix.status for fix in fixes], np.int64)
+    usable = usable_covariances(covariance, (status >= 0) & np.isfinite(position).all(axis=1))
+    return PositionReadings(name, np.array([stamp for stamp, _ in stamped], np.int64), position, usable, status)
+
+
+def usable_covariances(covariance: np.ndarray, needed: np.ndarray) -> np.ndarray:
+    """The covariances (N, 3, 3), or NO_COVARIANCE unless all that are `needed` (N,) are positive definite."""
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
+    finite = np.where(np.isfinite(covariance), covariance, 0.0)
+    if not needed.any() or not (np.linalg.eigvalsh(finite[needed])[:, 0] > 0.0).all():
+        return NO_COVARIANCE
+    return np.where(needed[:, None, None], finite, np.eye(3))
+
+
+FIX_RATES_HZ = (1e-2, 1000.0)  # lowest and highest: other rates show another unit of the stamps
+_SIGMA = r"(s|sd|std|stddev|sigma|std_dev)"
+METRIC = TableKind(
+    ("t [ns]",),
+    ("x [m]", "y [m]", "z [m]"),
+    (
+        STAMP,
+        (r"(p|pos|position|point|p_rs_r)_?x|x|east(ing)?|e",),
+        (r"(p|pos|position|point|p_rs_r)_?y|y|north(ing)?|n",),
+        (r"(p|pos|position|point|p_rs_r)_?z|z|up|u|height|h|altitude|alt",),
+    ),
+    FIX_RATES_HZ,
+)
+GEODETIC = TableKind(
+    ("t [ns]",),
+    ("latitude [deg]", "longitude [deg]", "height [m]"),
+    (
+        STAMP,
+        (r"lat(itude)?(_deg)?",),
+        (r"lon(g|gitude)?(_deg)?",),
+        (r"(ellipsoid(al)?_)?h(eight)?(_m)?|alt(itude)?(_m)?|hgt|hae",),
+    ),
+    FIX_RATES_HZ,
+)
+_DEVIATIONS = (
+    (rf"{_SIGMA}_?(x|e|east)",),
+    (rf"{_SIGMA}_?(y|n|north)",),
+    (rf"{_SIGMA}_?(z|u|up|h)",),
+)
+
+
+def read_position_table(sensor: PositionSensor, path: Path, note: Note = ignore) -> tuple[PositionReadings, Recorded]:
+    """The positions in a table, and their coordinates, geodetic or local, as the rig file or the names of the columns
+    say. Standard deviations are those of east, north and up, or of x, y and z. Raises
+    RecordingError naming file and line."""
+    layout, geodetic = sensor.layout, sensor.coordinates == "geodetic"
+    if sensor.coordinates is None:
+        geodetic = named(path, GEODETIC) if not layout.columns else places_by_name(GEODETIC, layout.columns) is not None
+    kind = GEODETIC if geodetic else METRIC
+    stated = _with_deviations(kind)
+    kind = stated if len(layout.columns) == len(stated.names) or (not layout.columns and named(path, stated)) else kind
+    table = read_table(path, kind, layout, note)
+    values = table.decimals
+    covariance = NO_COVARIANCE
+    if values.shape[1] == 6 and (values[:, 3:] > 0.0).all():
+        covariance = values[:, 3:, None] ** 2 * np.eye(3)
+    readings = PositionReadings(
+        sensor.name, table.integers[:, 0].copy(), values[:, :3].copy(), covariance, np.zeros(0, np.int64)
+    )
+    return readings, "geodetic" if geodetic else "local"
+
+
+def _with_deviations(kind: TableKind) -> TableKind:
+    return replace(kind, decimals=(*kind.decimals, "sx [m]", "sy [m]", "sz [m]"), known=(*kind.known, *_DEVIATIONS))

@@ -17,12 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.contradicted_guesses import MotionContradictedError
-from icalib.initialize.steps.rate_correlation import MAX_RATE_STEP_S, best_shift, correlation_in_words, max_rate_step
-from icalib.initialize.steps.smooth_trajectory import pairs_within
-from icalib.motion.imu_data import ImuData, clear_of
-from icalib.motion.pose_rows import Extrinsics
-from icalib.motion.stamp_intervals import MAX_INTERVAL_S
+from icalib.initialize.initializer import MotionContradictedError
+from icalib.initialize.rate_correlation import MAX_RATE_STEP_S, best_shift, correlation_in_words, max_rate_step
+from icalib.initialize.smooth_trajectory import pairs_within
+from icalib.motion.factor import Extrinsics
+from icalib.motion.imu_data import MAX_INTERVAL_S, ImuData, clear_of
 from icalib.rig import WheelKind, drive_names
 from icalib.sensors.wheels.spec import REVERSED_YAW
 

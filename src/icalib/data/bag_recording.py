@@ -1,0 +1,242 @@
+"""Recordings that are bags of ROS 1 or ROS 2: one file, or a folder of files."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from icalib.base.extras import load_typesys, load_zstd
+from icalib.base.files import unpacked
+from icalib.data.bags import ZSTD_MAGIC, Tally, open_storages
+from icalib.data.images import Payload, checked_payloads, file_payload
+from icalib.data.messages import MessageType, TopicInfo, choose_topic, find_topic, message_types
+from icalib.data.recording import Recording
+from icalib.data.stamps import WHOLE_RECORDING, Span, Window
+from icalib.errors import RecordingError
+from icalib.sensors.sensor import Sensor
+
+_SWAPPED_NS = 1_000_000_000  # largest lateness by transport; more means that the clock was set back
+
+
+@final
+class BagRecording(Recording):
+    """A bag. Stamps are those of message headers, or the receive time if the stamp is zero or there is no header."""
+
+    has_messages = True
+
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
+        super().__init__(root, window)
+        self._storages, self._notes = open_storages(root)
+        self._topics = self._list_topics()
+        self._received = self._received_ns()
+
+    def _received_ns(self) -> Span:
+        """Range of receive times [ns] of the messages in the time window, by the clock of the recorder. Raises
+        RecordingError if the window begins after the last message."""
+        spans = self._spans()
+        if self.window.is_all or not spans:
+            return -(2**63), 2**63 - 1
+        origin, last = min(first for first, _ in spans), max(last for _, last in spans)
+        low, high = self.window.bounds(origin)
+        if low > last:
+            raise self.window.refuse(str(self.root), (last - origin) * 1e-9)
+        self.note(self.window.note(str(self.root)))
+        return low, high
+
+    def topics(self) -> tuple[TopicInfo, ...]:
+        return self._topics
+
+    def stamps(self, topic: str) -> np.ndarray:
+        chosen = find_topic(str(self.root), self._topics, topic)
+        if not chosen.kind:
+            raise RecordingError(f"{self.root}: icalib does not read {chosen.type}; choose another topic than {topic}.")
+        return np.array([stamp_ns for stamp_ns, _ in self._messages(chosen)], np.int64)
+
+    def payloads(self, topic: str) -> Iterator[Payload]:
+        where = f"{self.root} {topic}"
+        images = (_payload(stamp, where, message) for stamp, message in self.messages(topic, "image"))
+        return checked_payloads(images, where, self.note)
+
+    def place(self, topic: str) -> str:
+        return f"{self.root} {topic}"
+
+    def find(self, path: str) -> Path | None:
+        """Path of the table `path` in the folder of the bag; None if it does not exist."""
+        table = self.root.parent / path
+        return table if table.is_file() else None
+
+    def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
+        if (table := self.find(path)) is None:
+            raise RecordingError(
+                f"{self.root.parent / path} does not exist, and a bag holds no such table; put the table beside the "
+                f"bag, or correct `{field}` of {sensor.name} in the rig file."
+            )
+        self._remember(table)
+        return table
+
+    def files(self) -> list[Path]:
+        return [*(storage.name for storage in self._storages), *super().files()]
+
+    def notes(self) -> tuple[str, ...]:
+        damage = (note for storage in self._storages for note in storage.notes)
+        return tuple(dict.fromkeys([*self._notes, *damage]))
+
+    def messages(
+        self, topic: str, kind: str, convert: Callable[[Any], Any] = lambda message: message
+    ) -> Iterator[tuple[int, Any]]:
+        chosen = choose_topic(str(self.root), self._topics, "", topic, kind)
+        return self._messages(chosen, convert)
+
+    def _messages(
+        self, topic: TopicInfo, convert: Callable[[Any], Any] = lambda message: message
+    ) -> Iterator[tuple[int, Any]]:
+        total = unstamped = 0
+        damaged: list[tuple[int, ValueError]] = []
+        for received_ns, encoding, content in self._contents(topic):
+            if encoding not in _stores():
+                raise RecordingError(
+                    f"{self.root} {topic.name}: messages have the encoding {encoding!r}, which is not one of "
+                    "ROS; convert the bag."
+                )
+            total += 1
+            try:
+                message = _deserialise(encoding, content, message_types()[topic.type])
+                converted = convert(message)
+            except ValueError as error:
+                damaged.append((received_ns, error))
+                continue
+            if not message_types()[topic.type].stamped:
+                yield received_ns, converted
+                continue
+            stamp = message.header.stamp
+            stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
+            unstamped += not stamp_ns
+            yield stamp_ns or received_ns, converted
+        if damaged:
+            self._note_damage(topic.name, damaged, total)
+        if unstamped:
+            self.note(
+                f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header. Their receive "
+                "times are used instead, which are late and jittery; let the driver stamp each message."
+            )
+
+    def _note_damage(self, topic: str, damaged: list[tuple[int, ValueError]], total: int) -> None:
+        """Note on `damaged` messages (receive time [ns], error). Raises RecordingError if all `total` are damaged."""
+        first_ns, error = damaged[0]
+        if len(damaged) == total:
+            others = ", and so are all others" if total > 1 else ""
+            raise RecordingError(
+                f"{self.root} {topic}: the message received at {first_ns} ns is damaged ({error}){others}; copy or "
+                "record the bag again."
+            ) from error
+        self.note(
+            f"{self.root} {topic}: {len(damaged)} of {total} messages are damaged and were left out, the first "
+            f"received at {first_ns} ns ({error})."
+        )
+
+    def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
+        """Receive time [ns], encoding and bytes of each message in the window, and of latched messages
+        (`MessageType.latched_suffix`) at any time. Raises RecordingError if the window contains none."""
+        low, high = self._received
+        suffix = message_types()[topic.type].latched_suffix
+        is_latched = suffix is not None and topic.name.endswith(suffix)
+        is_any_inside = self.window.is_all
+        for storage in self._storages:
+            wanted = {k for k, c in storage.connections.items() if (c.topic, c.type) == (topic.name, topic.type)}
+            for key, received_ns, content in storage.messages(wanted):
+                if is_latched or low <= received_ns < high:
+                    is_any_inside = True
+                    yield received_ns, storage.connections[key].encoding, content
+        if not is_any_inside and topic.count and topic.first_ns is not None and topic.last_ns is not None:
+            origin = min(first for first, _ in self._spans())
+            raise self.window.refuse(f"{self.root} {topic.name}", (topic.last_ns - origin) * 1e-9)
+
+    def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
+        """(N,) indices that sort readings by stamp, with a note. No change if a reading is late by more than 1 s: the
+        clock was set back, which later checks refuse."""
+        back = np.diff(stamps_ns, prepend=stamps_ns[:1]) < 0
+        late_ns = int((np.maximum.accumulate(stamps_ns) - stamps_ns).max()) if back.any() else 0
+        if not 0 < late_ns <= _SWAPPED_NS:
+            return np.arange(len(stamps_ns))
+        self.note(
+            f"{self.root} {topic}: {int(back.sum())} readings are out of order by up to {late_ns * 1e-6:.1f} "
+            "ms; all were sorted by stamp."
+        )
+        return np.argsort(stamps_ns, kind="stable")
+
+    def _list_topics(self) -> tuple[TopicInfo, ...]:
+        tallies: dict[tuple[str, str], Tally] = {}
+        for storage in self._storages:
+            counted = storage.tally()
+            for key, connection in storage.connections.items():
+                part = counted.get(key, Tally())
+                tallies.setdefault((connection.topic, connection.type), Tally()).add(
+                    part.count, part.first_ns, part.last_ns
+                )
+        return tuple(_topic_info(*name, tally) for name, tally in sorted(tallies.items()))
+
+
+def _topic_info(topic: str, name: str, tally: Tally) -> TopicInfo:
+    first, last = (tally.first_ns, tally.last_ns) if tally.count else (None, None)
+    known = message_types().get(name)
+    return TopicInfo(topic, name, known.kind if known else "", tally.count, first, last)
+
+
+def _payload(stamp_ns: int, where: str, message: Any) -> Payload:
+    if hasattr(message, "format"):  # CompressedImage
+        return file_payload(stamp_ns, where, message.data.tobytes(), message.format)
+    return Payload(
+        stamp_ns,
+        where,
+        message.encoding,
+        message.data.tobytes(),
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+    )
+
+
+@cache
+def _stores() -> dict[str, Any]:
+    """Deserializer of each encoding (ros1, cdr). The definitions of the types that icalib reads are the same in all ROS
+    releases."""
+    typesys = load_typesys()
+    ros1, ros2 = (typesys.get_typestore(s) for s in (typesys.Stores.ROS1_NOETIC, typesys.Stores.ROS2_HUMBLE))
+    for known in message_types().values():
+        if known.definition:
+            for store in (ros1, ros2):
+                store.register(typesys.get_types_from_msg(known.definition, known.read_as or known.name))
+    return {"ros1": ros1.deserialize_ros1, "cdr": ros2.deserialize_cdr}
+
+
+def _deserialise(encoding: str, content: bytes, known: MessageType) -> Any:
+    """The message of type `known`. Raises ValueError if `content` is damaged or of another type."""
+    if content.startswith(ZSTD_MAGIC):  # ROS 2 can compress message by message
+        content = _decompress(content)
+    try:
+        if encoding in known.parsers:
+            return known.parsers[encoding](content)
+        return _stores()[encoding](content, known.read_as or known.name)
+    except (struct.error, IndexError, *_serde_errors()) as error:
+        raise ValueError(str(error)) from error
+
+
+def _decompress(content: bytes) -> bytes:
+    zstd = load_zstd()
+    try:
+        return unpacked(zstd.ZstdDecompressor(), content)
+    except zstd.ZstdError as error:
+        raise ValueError(str(error)) from error
+
+
+@cache
+def _serde_errors() -> tuple[type[Exception], ...]:
+    from rosbags.serde import SerdeError
+
+    return (SerdeError,)

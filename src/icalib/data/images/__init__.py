@@ -1,1 +1,0 @@
-"""Images and videos of recordings: reading, checks, decoding."""

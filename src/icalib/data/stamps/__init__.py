@@ -1,1 +1,0 @@
-"""Checks of timestamps: unit, order, duplicates, clock jumps; time windows."""

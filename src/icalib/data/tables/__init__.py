@@ -1,1 +1,0 @@
-"""Text tables (CSV): parsing, identification of columns, tables of each kind of sensor."""

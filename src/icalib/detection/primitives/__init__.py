@@ -1,1 +1,0 @@
-"""What targets consist of: edges, saddles, quads, tags, ellipses."""

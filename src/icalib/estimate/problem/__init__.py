@@ -1,1 +1,0 @@
-"""The least-squares problem of one pass, from rig and data, and its solution."""

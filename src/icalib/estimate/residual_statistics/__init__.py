@@ -1,1 +1,0 @@
-"""Statistics of the residuals after a fit: noise, covariances and cross-validation."""

@@ -1,0 +1,169 @@
+"""Score test of an effect that the model of one factor leaves out (Lagrange multiplier test; Rao 1948).
+
+The parameters of the effect are zero in the model. At the solution, one Newton step of them and of all estimated
+parameters follows from the normal equations and from the derivative of the factor's gradient by the effect. The score
+of each segment of the recording gives its covariance, as for `split_covariance`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from icalib.estimate.problem import Problem
+from icalib.estimate.residual_statistics import PieceGradient, Segments
+from icalib.estimate.solver import Outcome, SolverOptions, minimise
+from icalib.model.sensor_model import TargetFactor
+from icalib.motion.factor import Factor, Residuals, Whitened, of_type
+from icalib.optim.arrowhead import Piece, restricted_inverse
+from icalib.optim.state import State
+
+STEP = 1e-4  # of the difference quotients; effects are linear far beyond it
+MAX_SIGMA = 0.1  # formal standard deviation of an effect [rad]; a direction with a larger one is not tested
+
+
+class LeftOut(NamedTuple):
+    """An effect that differs from zero. value (m,): Newton step of its parameters; sigmas: the largest in standard
+    deviations; change (B,): the step of the calibration parameters, in their units."""
+
+    value: np.ndarray
+    sigmas: float
+    change: np.ndarray
+
+
+class _Response(NamedTuple):
+    """Derivatives by m parameters of an effect. gradients: of the gradient; scores (G, m): of half the chi^2 of each
+    segment; information (m, m): J^T J."""
+
+    gradients: list[PieceGradient]
+    scores: np.ndarray
+    information: np.ndarray
+
+
+def score_test(
+    segments: Segments, outcome: Outcome, effect: Callable[[np.ndarray], Factor], m: int, least: float
+) -> LeftOut | None:
+    """The effect with `m` parameters, along its principal directions that differ from zero by `least` standard
+    deviations. effect: the factor with given values of these. None if no direction differs."""
+    response, B, G, t = (
+        _response(segments, effect, m),
+        len(outcome.information),
+        segments.count,
+        outcome.problem.tolerance,
+    )
+    scratch = segments.problem.reusable_output(outcome.residuals)
+    by_segment = [PieceGradient.of(segments.piece(g, scratch)) for g in range(G)]
+    joint = segments.together([*by_segment, *response.gradients], scratch)
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, outcome.problem.fixed_directions)
+    inverse = t[:, None] * inverse * t
+    b, d = slice(B, B + G), slice(B + G, B + G + m)
+    cross = joint[:B, d]
+    information = response.information + joint[d, d] - cross.T @ inverse @ cross
+    scores = response.scores + joint[b, d] - joint[:B, b].T @ inverse @ cross
+    values, vectors = np.linalg.eigh(information)
+    tested = values > MAX_SIGMA**-2
+    values, vectors = values[tested], vectors[:, tested]
+    white = scores @ vectors / np.sqrt(values)
+    ratio = np.sqrt(max(1.0, G * white.var(axis=0, ddof=1).mean())) if len(values) else 1.0
+    size = -(response.scores.sum(axis=0) @ vectors) / np.sqrt(values)
+    differs = np.abs(size) > least * ratio
+    if not differs.any():
+        return None
+    value = vectors[:, differs] @ (size / np.sqrt(values))[differs]
+    return LeftOut(value, float(np.abs(size).max() / ratio), -inverse @ cross @ value)
+
+
+def _response(segments: Segments, effect: Callable[[np.ndarray], Factor], m: int) -> _Response:
+    """Difference quotients of rows and gradients by the parameters of `effect`."""
+    problem, B = segments.problem, segments.problem.layout.size
+    chain, calib = np.zeros((m, problem.n_keyframes, 15)), np.zeros((m, B))
+    scores, information = np.zeros((segments.count, m)), np.zeros((m, m))
+    changed = [[effect(sign * STEP * axis) for sign in (1.0, -1.0)] for axis in np.eye(m)]
+    unchanged = effect(np.zeros(m))
+    for g, (first, last) in enumerate(zip(segments.ends[:-1], segments.ends[1:], strict=True)):
+        out, _ = _at(segments, unchanged, first, last)
+        J = []
+        for j, pair in enumerate(changed):
+            (plus, a), (minus, b) = (_at(segments, factor, first, last) for factor in pair)
+            J.append((out.root * (plus.residual - minus.residual)).ravel() / (2.0 * STEP))
+            chain[j, first : last + 1] += (a.chain - b.chain) / (2.0 * STEP)
+            calib[j] += (a.calib - b.calib) / (2.0 * STEP)
+        scores[g] = np.array(J) @ (out.root * out.residual).ravel()
+        information += np.array(J) @ np.array(J).T
+    return _Response([PieceGradient(0, *x) for x in zip(chain, calib, strict=True)], scores, information)
+
+
+def _at(segments: Segments, factor: Factor, first: int, last: int) -> tuple[Whitened, PieceGradient]:
+    """Rows of `factor` between two keyframes, all others zero, and their gradient."""
+    out, piece = factor.output(), Piece.zeros(int(first), int(last), segments.problem.layout.size)
+    factor.accumulate(segments.state, piece, out)
+    return out, PieceGradient.of(piece)
+
+
+# Size of the target according to all measurements but the ruler, above all those of the accelerometer.
+#
+# Cameras alone cannot determine the size. It is not estimated, because accelerometers determine it to a few per cent
+# only, a ruler to 0.1 %. Here it is the minimum of the profile cost p(s), the least cost over all other parameters for
+# the relative size s. All lengths that cameras observe scale with the target, which leaves the cost of the cameras
+# unchanged. p(s) is the cost after this scaling, less the decrease that one step predicts.
+
+SIZE_STEP = 1e-3  # relative step of difference quotients: small enough for p to be quadratic, large against rounding
+MAX_SIZE_SIGMA = 0.05  # relative: with a larger standard deviation the size is unobservable
+MAX_SIZE_CHANGE = 5e-3  # relative: a larger change needs another round at a new state
+MAX_SIZE_ROUNDS = 3
+INNER_TOLERANCE = 0.5  # of half the chi^2, for the state of the next round
+
+
+@dataclass(frozen=True)
+class TargetSize:
+    """Ratio of true to stated size, and its formal standard deviation."""
+
+    ratio: float
+    std: float
+
+
+def target_size(problem: Problem, state: State) -> TargetSize | None:
+    """True over stated size of the target by the accelerometer, with its standard deviation. None without a target or
+    an IMU, or if the size is unobservable. state: the solution with the stated size."""
+    sees_target = any(f.sees_target for f in of_type(problem.factors, TargetFactor))
+    if not sees_target or not problem.framed or problem.chain.imu is None:
+        return None
+    ratio = std = 1.0
+    workspace = problem.pieces(), {key: f.discarded_output() for key, f in problem.factors.items()}
+    for _ in range(MAX_SIZE_ROUNDS):
+        sizes = (ratio - SIZE_STEP, ratio, ratio + SIZE_STEP)
+        costs = [_least_cost(*_grown(problem, state, ratio, size), *workspace) for size in sizes]
+        slope = (costs[2] - costs[0]) / (2.0 * SIZE_STEP)
+        curvature = (costs[2] - 2.0 * costs[1] + costs[0]) / SIZE_STEP**2
+        if curvature * MAX_SIZE_SIGMA**2 < 1.0:
+            return None
+        change, std = -slope / curvature, curvature**-0.5
+        grown, begin = _grown(problem, state, ratio, ratio + change)
+        ratio += change
+        if abs(change) < MAX_SIZE_CHANGE:
+            break
+        state = minimise(grown, begin, SolverOptions(INNER_TOLERANCE)).state
+    return TargetSize(float(ratio), float(std))
+
+
+def _grown(problem: Problem, state: State, old_size: float, size: float) -> tuple[Problem, State]:
+    """The problem with a target `size` times the stated one, and the state with all lengths that cameras observe scaled
+    by size / old_size. Fixed lengths are not scaled."""
+    factors, scale = tuple(f.with_target_size(size) for f in of_type(problem.factors, TargetFactor)), size / old_size
+    bodies = factors[0].bodies
+    lengths = {(f.name, "translation") for f in factors} | {(b, "shape") for b in bodies.bending}
+    lengths |= {(b, "translation") for b in bodies.names if bodies.several}
+    lengths &= {b.key for b in problem.layout.free}
+    values = {key: scale * v if key in lengths else v for key, v in state.values.items()}
+    begin = replace(state, position=scale * state.position, velocity=scale * state.velocity, values=values)
+    return problem.replacing(factors), begin
+
+
+def _least_cost(problem: Problem, state: State, pieces: tuple[Piece, ...], scratch: Residuals) -> float:
+    """Approximate minimum over all parameters of half the robust chi^2: its value at `state`, less the decrease that
+    one Newton step predicts. Overwrites `pieces` and `scratch`."""
+    cost = problem.linearise(state, pieces, scratch, curved=True)
+    return cost - problem.solve(pieces).decrease

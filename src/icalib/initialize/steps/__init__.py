@@ -1,1 +1,0 @@
-"""Steps that initial guesses of several kinds of sensors share."""

@@ -1,1 +1,0 @@
-"""A sensor's own trajectory, aligned to the IMU's readings or to a known trajectory."""

@@ -1,0 +1,190 @@
+"""Figures as plain data that plotly.js draws. Plotly's Python package is slow to import and not needed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from icalib.result import Calibration, RowResiduals
+from icalib.sensors import call_kind
+from icalib.sensors.stream import Residuals
+
+Figure = dict[str, Any]
+COLORS = ("#2563a8", "#d97706", "#15803d", "#7c3aed", "#be185d", "#0e7490")
+AXIS_COLORS = ("#c0392b", "#1e8449", "#2563a8")  # x, y, z
+REJECTED = "#dc2626"
+VIEW = {
+    "aspectmode": "data",
+    "camera": {"eye": {"x": 1.5, "y": 1.5, "z": 1.1}, "center": {"x": 0, "y": 0, "z": -0.15}},
+}  # layout of 3D scenes
+DIGITS = 5  # significant digits of numbers in the page; more only make the file larger
+_GRID = {"gridcolor": "#e5e7eb", "zerolinecolor": "#cbd5e1", "linecolor": "#94a3b8"}
+
+
+def figure(traces: list[dict[str, Any]], height: int = 380, **layout: Any) -> Figure:
+    """A figure of `traces` in the style of the page. height [px]; layout: further entries of plotly's layout."""
+    style: dict[str, Any] = {
+        "height": height,
+        "margin": {"l": 64, "r": 16, "t": 34, "b": 48},
+        "paper_bgcolor": "rgba(0,0,0,0)",
+        "plot_bgcolor": "#ffffff",
+        "font": {"family": "system-ui, sans-serif", "size": 12, "color": "#1f2937"},
+        "legend": {"orientation": "h", "y": 1.02, "yanchor": "bottom", "x": 0},
+        "hovermode": "closest",
+    }
+    return {"data": traces, "layout": style | layout}
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """Plotly layout of an axis with its title, in the style of the page."""
+    return _GRID | {"title": {"text": title}} | more
+
+
+def line(x: np.ndarray, y: np.ndarray, name: str, color: str, **more: Any) -> dict[str, Any]:
+    """A scatter trace drawn as a line."""
+    style = {"type": "scatter", "mode": "lines", "line": {"color": color, "width": 1.4}}
+    return style | {"x": numbers(x), "y": numbers(y), "name": name} | more
+
+
+def dots(x: np.ndarray, y: np.ndarray, name: str, color: str, size: float = 3, **more: Any) -> dict[str, Any]:
+    """A scatter trace drawn as dots."""
+    marker = {"color": color, "size": size, "opacity": 0.6}
+    style = {"type": "scatter", "mode": "markers", "marker": marker}
+    return style | {"x": numbers(x), "y": numbers(y), "name": name} | more
+
+
+def path_3d(points: np.ndarray, name: str, color: str, **more: Any) -> dict[str, Any]:
+    """A 3D line trace through points (N, 3); a row of NaN interrupts the line."""
+    x, y, z = (numbers(points[:, i]) for i in range(3))
+    style = {"type": "scatter3d", "mode": "lines", "line": {"color": color, "width": 4}, "hoverinfo": "name"}
+    return style | {"x": x, "y": y, "z": z, "name": name} | more
+
+
+def stacked_axes(titles: list[str], gap: float = 0.045) -> dict[str, Any]:
+    """Layout of panels stacked vertically with a common time axis. Traces of panel i belong to the y-axis `y_of(i)`."""
+    n = len(titles)
+    panel = (1.0 - gap * (n - 1)) / n
+    layout: dict[str, Any] = {"xaxis": axis("time [s]", anchor=y_of(n - 1))}
+    for i, title in enumerate(titles):
+        top = 1.0 - i * (panel + gap)
+        layout[y_of(i).replace("y", "yaxis")] = axis(title, domain=[max(0.0, top - panel), top])
+    return layout
+
+
+def y_of(panel: int) -> str:
+    """Plotly's name of the y-axis of panel number `panel`."""
+    return "y" if panel == 0 else f"y{panel + 1}"
+
+
+def numbers(values: np.ndarray) -> list[Any]:
+    """Nested lists of `values`, rounded to `DIGITS` significant digits. Values that are not finite become None, as JSON
+    has no NaN."""
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim > 1:
+        return [numbers(row) for row in values]
+    return [float(f"{v:.{DIGITS}g}") if np.isfinite(v) else None for v in values.tolist()]
+
+
+def thin(count: int, most: int) -> np.ndarray:
+    """Indices of at most `most` of `count` items, evenly spaced."""
+    return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
+
+
+# Figure of `RowResiduals` over time.
+
+MOST_ROWS = 2500  # rows in one figure; more are thinned out
+DISPLAY_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
+
+
+def panels(r: RowResiduals) -> Figure:
+    """Residuals over time, one panel for each column, with a common time axis. Units with rad and m are shown in mrad
+    and mm."""
+    keep = thin(len(r.seconds), MOST_ROWS)
+    units = [DISPLAY_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
+    traces = [
+        line(
+            r.seconds[keep],
+            scale * r.residual[keep, k],
+            label,
+            COLORS[k % len(COLORS)],
+            yaxis=y_of(k),
+            line={"color": COLORS[k % len(COLORS)], "width": 1},
+        )
+        for k, (label, (_, scale)) in enumerate(zip(r.labels, units, strict=True))
+    ]
+    titles = [f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, units, strict=True)]
+    return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))
+
+
+# Histogram of the normalised residuals of all sensors.
+
+REACH = 6.0  # range of the histogram on either side of zero, in standard deviations
+BINS = 96
+
+
+def normalised_histogram(c: Calibration) -> Figure:
+    """Densities of residuals over their standard deviations, compared with the standard normal density. The logarithmic
+    axis shows the tails."""
+    edges = np.linspace(-REACH, REACH, BINS + 1)
+    x = 0.5 * (edges[1:] + edges[:-1])
+    traces = []
+    for i, (name, z) in enumerate(_normalised(c).items()):
+        count, _ = np.histogram(z, edges)
+        density = count / max(1, len(z)) / (edges[1] - edges[0])
+        density = np.where(count > 0, density, np.nan)
+        step = {"color": COLORS[i % len(COLORS)], "width": 1.6, "shape": "hvh"}
+        traces.append(line(x, density, name, COLORS[i % len(COLORS)], line=step))
+    normal = np.exp(-0.5 * x**2) / np.sqrt(2.0 * np.pi)
+    dashed = {"color": "#6b7280", "dash": "dash", "width": 1.4}
+    traces.append(line(x, normal, "standard normal", "#6b7280", line=dashed))
+    return figure(
+        traces,
+        380,
+        xaxis=axis("residual / standard deviation"),
+        yaxis=axis("density", type="log", range=[-5, 0], exponentformat="power"),
+    )
+
+
+def _normalised(c: Calibration) -> dict[str, np.ndarray]:
+    """Residuals over their standard deviation, by sensor and name."""
+    out = {f"{r.sensor} {name}": z for r in c.residuals.values() for name, z in r.normalised().items()}
+    return {name: z for name, z in out.items() if len(z)}
+
+
+# Data that the 3D view shows of residuals: curves over time, and points in space. Each kind of sensor defines them.
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualCurve:
+    """Curves over time. name: the kind of residual, "" if the sensor has only one. seconds (n,); values (n, m), one
+    column for each label, whitened or in the unit that the label names."""
+
+    name: str
+    seconds: np.ndarray
+    values: np.ndarray
+    labels: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualCloud:
+    """Points (n, 3) [m] measured by a sensor, in the world frame, at seconds (n,). size (n,): absolute values of their
+    residuals [m]."""
+
+    sensor: str
+    seconds: np.ndarray
+    points: np.ndarray
+    size: np.ndarray
+
+
+def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
+    """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
+    of `RowResiduals`."""
+    kind_curves = call_kind(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
+    if kind_curves is not None:
+        yield from kind_curves
+    elif isinstance(r, RowResiduals):
+        for k, label in enumerate(r.labels):
+            yield ResidualCurve(label, r.seconds, r.whitened[:, k : k + 1], (f"{label}, whitened",))

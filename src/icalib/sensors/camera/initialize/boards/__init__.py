@@ -1,1 +1,0 @@
-"""Initial guess of cameras that see a target of one or several bodies."""

@@ -1,1 +1,0 @@
-"""Initial guess of cameras with feature tracks."""

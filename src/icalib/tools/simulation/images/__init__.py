@@ -1,1 +1,0 @@
-"""Rendered images of targets and rooms."""
