@@ -20,12 +20,12 @@ from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import Problem
 from icalib.estimate.solver import Visit
 from icalib.initialize.rig_guess import attempt
+from icalib.kinds import readers
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
 from icalib.result.calibration import provenance
 from icalib.rig import Rig
 from icalib.rig.file import check_complete, load_rig
-from icalib.sensors import call_kind
 from icalib.validation import assess, stated_words, visited
 
 READING_SHARE, DETECTION_SHARE = 0.1, 0.8  # of the total time, without and with detection in images
@@ -85,7 +85,7 @@ def measure(
 def _reading_share(rig: Rig, opened: Mapping[str, Recording]) -> float:
     """Expected fraction of the calibration time that reading takes, for the progress display."""
     pairs = ((r, s) for r in opened.values() for s in rig.sensors.values())
-    detection = any(call_kind(s.sensor_type, "read", "needs_detection", r, s, rig.has_target) for r, s in pairs)
+    detection = any(readers()[s.sensor_type].needs_detection(r, s, rig.has_target) for r, s in pairs)
     return DETECTION_SHARE if detection else READING_SHARE
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -13,7 +14,8 @@ from icalib.data import tables as files
 from icalib.data.messages import MessageType, message_types
 from icalib.data.recordings import FolderRecording, open_recording
 from icalib.data.tables import STAMP, TableFile, TableKind, read_table, table_files
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.kinds import readers
+from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.pose import read as pose
 
 STAMPS = [1_700_000_000_000_000_000 + 100_000_000 * k for k in range(4)]
@@ -23,10 +25,11 @@ POSITIONS = TableKind(("t [ns]",), ("x [m]", "y [m]", "z [m]"), (STAMP, ("x",), 
 @pytest.fixture
 def declare(monkeypatch) -> Iterator[Callable[[str, object], None]]:
     """Adds one declaration to those of pose sensors."""
-    caches = (topics.message_types, files.table_files)
+    caches = (readers, topics.message_types, files.table_files)
 
     def add(name: str, declared: object) -> None:
-        monkeypatch.setattr(pose, name, (*getattr(pose, name), declared))
+        more = dataclasses.replace(pose.READER, **{name: (*getattr(pose.READER, name), declared)})
+        monkeypatch.setattr(pose, "READER", more)
         for cache in caches:
             cache.cache_clear()
 
@@ -37,19 +40,19 @@ def declare(monkeypatch) -> Iterator[Callable[[str, object], None]]:
 
 
 def test_every_kind_declares_what_it_is_read_from():
-    reads = [facet(kind, "read") for kind in SENSOR_KINDS]
-    assert all(callable(read.read) and callable(read.source) and read.MESSAGES and read.TABLES for read in reads)
+    assert tuple(readers()) == SENSOR_KINDS
+    assert all(reader.messages and reader.tables for reader in readers().values())
 
 
 def test_kinds_that_share_a_type_of_messages_call_its_content_alike():
-    declared = [t for kind in SENSOR_KINDS for t in facet(kind, "read").MESSAGES]
+    declared = [t for reader in readers().values() for t in reader.messages]
     assert all(t == message_types()[t.name] for t in declared)
     assert len(declared) > len(message_types())  # odometry: wheels and pose sensors
 
 
 @pytest.mark.parametrize("form", ["ros1", "ros2"])
 def test_messages_of_a_new_type_are_read(tmp_path, write, declare, form):
-    declare("MESSAGES", MessageType("geometry_msgs/msg/PointStamped", "point"))
+    declare("messages", MessageType("geometry_msgs/msg/PointStamped", "point"))
     make = write.maker(form)
     points = [make.make("geometry_msgs/msg/PointStamped", make.header(t, "map"), make.vector([k, 2.0, 3.0], "Point"))
               for k, t in enumerate(STAMPS)]  # fmt: skip
@@ -65,7 +68,7 @@ def test_files_of_a_new_name_are_listed(tmp_path, declare):
     def stamps(path: Path, layout: object) -> np.ndarray:
         return read_table(path, POSITIONS).integers[:, 0]
 
-    declare("TABLES", TableFile("*.pos", "table of positions", "position", stamps))
+    declare("tables", TableFile("*.pos", "table of positions", "position", stamps))
     (tmp_path / "gnss0").mkdir()
     rows = "".join(f"{t},{k},0,0\n" for k, t in enumerate(STAMPS))
     (tmp_path / "gnss0" / "solution.pos").write_text("t,x,y,z\n" + rows)

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from icalib.cli.console import print_result
 from icalib.errors import CalibrationError
 from icalib.export.formats import write_outputs
-from icalib.report import page, report_html
+from icalib.report import report_html
 from icalib.result import Calibration, RecordingSpan, SensorFit, load_calibration, relative_pose, relative_poses
 from icalib.result.quantities import rows
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
@@ -234,19 +234,6 @@ def warnings(
     imu = ImuSensor("imu0", "imu0", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
     rig = Rig(by_name(imu, Lidar("lidar0", "lidar0", noise), Wheels("wheel0", "wheel0", **wheels)))
     return causes.misfit_words(rig, SensorFit(sensor, kind, 400, dof, ratio * dof), white) or ""
-
-
-def test_kinds_without_views_and_words_of_their_own_get_general_ones(
-    robot: Calibration, monkeypatch: pytest.MonkeyPatch
-):
-    for module in (page, causes):
-        monkeypatch.setattr(module, "facet", lambda kind, name: None)
-    (section,) = page.sections(robot)
-    assert (section.name, section.title) == ("wheels", "Wheels")
-    assert [t["name"] for t in section.figures["wheels-0"]["data"]] == ["left", "right", "lateral", "vertical"]
-    words = "yaw residuals of wheel0 are 2x larger than its stated noise predicts"
-    assert warnings("yaw", 4.0) == f"{words}; state a larger one."
-    assert "no white noise" in warnings("yaw", 4.0, white=False) and warnings("yaw", 1.5) == ""
 
 
 def test_more_slip_than_allowed_is_warned_of():

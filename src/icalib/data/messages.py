@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from icalib.errors import RecordingError
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.kinds import readers
 
 _MAX_LISTED = 20
 
@@ -57,12 +57,12 @@ class UnreadType:
 @cache
 def message_types() -> dict[str, MessageType]:
     """All message types that kinds of sensors declare, by name."""
-    return {t.name: t for kind in SENSOR_KINDS for t in facet(kind, "read").MESSAGES}
+    return {t.name: t for reader in readers().values() for t in reader.messages}
 
 
 def type_not_read(name: str) -> tuple[str, str] | None:
     """`kind` and `words` of the `UnreadType` that the message type `name` matches; None if there is none."""
-    unread = (t for kind in SENSOR_KINDS for t in getattr(facet(kind, "read"), "UNREAD", ()))
+    unread = (t for reader in readers().values() for t in reader.unread)
     return next(((t.kind, t.words) for t in unread if re.fullmatch(t.pattern, name, re.IGNORECASE)), None)
 
 

@@ -6,16 +6,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
 from icalib.data.images import DecodedImage, Payload, frames
-from icalib.data.messages import TopicInfo, choose_topic
+from icalib.data.messages import MessageType, TopicInfo, UnreadType, choose_topic
 from icalib.data.stamps import WHOLE_RECORDING, S, Span, Window, cut, stamps_inside
+from icalib.data.tables import TableFile
 from icalib.errors import RecordingError
+from icalib.kinds import readers
 from icalib.rig import Rig
-from icalib.sensors import facet
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
 
@@ -106,7 +107,7 @@ class Recording(ABC):
 
     def where(self, sensor: Sensor) -> str:
         """Name of the source of the sensor's data in messages, such as the file. Raises RecordingError without data."""
-        source: Path | TopicInfo | str = facet(sensor.sensor_type, "read").source(self, sensor)
+        source = readers()[sensor.sensor_type].source(self, sensor)
         return self.place(source.name) if isinstance(source, TopicInfo) else str(source)
 
     def image_topics(self) -> tuple[TopicInfo, ...]:
@@ -169,3 +170,24 @@ class Reading:
     rig: Rig
     cut: Cut
     progress: Progress = lambda *_: None
+
+
+K = TypeVar("K", bound=Sensor)
+
+
+@dataclass(frozen=True)
+class Reader(Generic[K]):
+    """How a kind of sensor is read from recordings.
+
+    messages, tables: types of messages, and files of a folder, that it is read from. read: the checked stream of each
+    sensor, with notes. source: the table, the topic, or words for the place of its data. unread: types of messages with
+    its data in a form that is not read. needs_detection: whether `read` detects something in images, which takes long;
+    the last argument tells whether the rig has a target.
+    """
+
+    messages: tuple[MessageType, ...]
+    tables: tuple[TableFile, ...]
+    read: Callable[[Recording, Sequence[K], Reading], list[ReadStream]]
+    source: Callable[[Recording, K], Path | TopicInfo | str]
+    unread: tuple[UnreadType, ...] = ()
+    needs_detection: Callable[[Recording, K, bool], bool] = lambda *_: False

@@ -21,8 +21,8 @@ from icalib.data.recording import Progress, Reading, Recording
 from icalib.data.stamps import LONGEST_S, ClockJumps, S, Window
 from icalib.data.tables import named_tables, table_files
 from icalib.errors import CalibrationError, RecordingError
+from icalib.kinds import readers
 from icalib.rig import Rig
-from icalib.sensors import SENSOR_KINDS, facet
 
 __all__ = [
     "BagRecording",
@@ -156,9 +156,9 @@ def read_measurements(recording: Recording, rig: Rig, progress: Progress = lambd
     jumps = ClockJumps(LONGEST_S)
     reading = Reading(rig, _uncut if rig.cameras_alone else jumps.cut, progress)
     streams = []
-    for kind in SENSOR_KINDS:
+    for kind, reader in readers().items():
         sensors = [s for s in rig.sensors.values() if s.sensor_type == kind]
-        streams += facet(kind, "read").read(recording, sensors, reading) if sensors else []
+        streams += reader.read(recording, sensors, reading) if sensors else []
     notes = sum((sentences for _, sentences in streams), recording.notes() + jumps.notes)
     return Measurements.of_streams(*(stream for stream, _ in streams), notes=notes)
 

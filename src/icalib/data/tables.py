@@ -19,8 +19,8 @@ from icalib.data.images import Note, are_most, ignore, pictures_in, stamped_by_n
 from icalib.data.stamps import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
 from icalib.data.table_kernels import LEFT_OUT, POWERS, parse
 from icalib.errors import RecordingError
+from icalib.kinds import readers
 from icalib.rig import PLAIN_TABLE, Axes, TableLayout
-from icalib.sensors import SENSOR_KINDS, facet
 
 # Reader of numeric text tables (CSV, also gzip): exact integers and stamps, fast floats.
 #
@@ -342,12 +342,12 @@ class TableFile:
 @cache
 def table_files() -> tuple[TableFile, ...]:
     """Declarations of all kinds of sensors."""
-    return tuple(t for kind in SENSOR_KINDS for t in facet(kind, "read").TABLES)
+    return tuple(t for reader in readers().values() for t in reader.tables)
 
 
 def rows_of(sensor_type: str) -> TableFile | None:
     """The declaration with `rows` of a sensor type, for images without timestamps; None if there is none."""
-    return next((t for t in facet(sensor_type, "read").TABLES if t.rows is not None), None)
+    return next((t for t in readers()[sensor_type].tables if t.rows is not None), None)
 
 
 def named_tables(folder: Path) -> list[tuple[Path, TableFile]]:

@@ -18,10 +18,11 @@ from icalib.estimate.inputs import Inputs, inputs_for, origin_difference
 from icalib.geometry import so3
 from icalib.geometry.targets import NoTarget
 from icalib.initialize.smooth_trajectory import BodyPoses, SmoothTrajectory
+from icalib.kinds import initializers
 from icalib.motion.imu_data import imu_data
 from icalib.optim.state import Key, State
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.sensor import MOUNTED_NAMES, TRANSLATION
 
 # How the sensors of one kind take part in the initial guess.
@@ -191,8 +192,7 @@ NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 def initializer(kind: str) -> Initializer[Any]:
     """The initializer of a kind of sensor; `NO_INITIALIZER` if the kind has none."""
-    module = facet(kind, "initialize")
-    return NO_INITIALIZER if module is None else module.INITIALIZER
+    return initializers()[kind]
 
 
 def initializer_of(sensor: Sensor) -> Initializer[Any]:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_chec
 import numpy as np
 
 from icalib.data.measurements import Measurements, Part
+from icalib.kinds import models
 from icalib.model.bodies import Bodies
 from icalib.motion.factor import Factor, FactorKey, FitKey, Residuals, Squares
 from icalib.motion.imu_data import ImuData
@@ -18,7 +19,7 @@ from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import EstimatedMotion, instants
 from icalib.optim.state import Entry, Key, Layout, State, in_recording
 from icalib.rig import ParameterSpec, Rig, Sensor, Settings, scene
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.sensor import TIME_OFFSET
 
 S = TypeVar("S", bound=Sensor)
@@ -230,7 +231,7 @@ def all_models() -> Iterator[SensorModel[Any, Any]]:
 @cache
 def kind_model(kind: str) -> SensorModel[Any, Any]:
     """The model of one of `SENSOR_KINDS`."""
-    return facet(kind, "model").MODEL
+    return models()[kind]
 
 
 def own_entries(

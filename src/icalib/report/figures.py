@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from icalib.kinds import presenters
 from icalib.result import Calibration, RowResiduals
-from icalib.sensors import call_kind
 from icalib.sensors.stream import Residuals
 
 Figure = dict[str, Any]
@@ -182,9 +182,9 @@ class ResidualCloud:
 def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
     """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
     of `RowResiduals`."""
-    kind_curves = call_kind(c.rig["sensors"][r.sensor]["type"], "show", "curves", r)
-    if kind_curves is not None:
-        yield from kind_curves
+    own = presenters()[c.rig["sensors"][r.sensor]["type"]].curves
+    if own is not None:
+        yield from own(r)
     elif isinstance(r, RowResiduals):
         for k, label in enumerate(r.labels):
             yield ResidualCurve(label, r.seconds, r.whitened[:, k : k + 1], (f"{label}, whitened",))

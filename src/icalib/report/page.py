@@ -5,17 +5,28 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files
 from string import Template
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from icalib.kinds import presenters
 from icalib.report import rig_figures
-from icalib.report.figures import Figure, axis, dots, figure, line, normalised_histogram, panels
+from icalib.report.figures import (
+    Figure,
+    ResidualCloud,
+    ResidualCurve,
+    axis,
+    dots,
+    figure,
+    line,
+    normalised_histogram,
+    panels,
+)
 from icalib.report.rig_figures import SIGMAS, ellipsoids, magnification
 from icalib.result import (
     Calibration,
@@ -58,7 +69,7 @@ from icalib.result.verdict import (
     tolerance,
     worst,
 )
-from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
+from icalib.sensors.stream import Residuals
 
 _NO_CROSS_VALIDATION = (
     "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "
@@ -186,15 +197,9 @@ class Section:
 
 
 def sections(c: Calibration) -> list[Section]:
-    """Sections of all kinds of sensors in the order of `SENSOR_KINDS`, with the IMU last. A kind without a `sections`
-    function gets those of `row_sections`."""
-    all_sections = []
-    for kind in (*SENSOR_KINDS[1:], SENSOR_KINDS[0]):
-        module = facet(kind, "show")
-        all_sections += (
-            module.sections(c) if hasattr(module, "sections") else row_sections(c, kind, kind, kind.capitalize(), "")
-        )
-    return all_sections
+    """Sections of all kinds of sensors in the order of `SENSOR_KINDS`, with the IMU last."""
+    first, *others = presenters().values()
+    return [section for presenter in (*others, first) for section in presenter.sections(c)]
 
 
 def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -> Iterator[Section]:
@@ -443,7 +448,9 @@ def size_words(c: Calibration) -> str:
     several = f"{len(c.recordings)} recordings, " if len(c.recordings) > 1 else ""
     span = sum(r.end - r.start for r in c.recordings) if several else duration
     several += f"{span:.1f} s, " if c.rates else ""  # pictures have no clock
-    return several + ", ".join([*call_all_kinds("show", "amounts", c), f"{len(c.trajectory.seconds)} keyframes"])
+    return several + ", ".join(
+        [*(text for p in presenters().values() for text in p.amounts(c)), f"{len(c.trajectory.seconds)} keyframes"]
+    )
 
 
 # Cross-validation in the report: the estimates without each segment (jackknife), and the two-fold cross-validation.
@@ -558,3 +565,23 @@ def _printed(c: Calibration) -> str:
     return (
         f"the standard deviations printed here are {low if low == high else f'{low} to {high}'} times the formal ones."
     )
+
+
+R = TypeVar("R", bound=Residuals)
+
+
+@dataclass(frozen=True)
+class Presenter(Generic[R]):
+    """What report, console and 3D view show of one kind of sensor.
+
+    sections: of the report. curves: of one residual record over time; None: one for each column. clouds: points and the
+    size of their residuals. amounts: numbers of measurements, as text. shape: (n, 3) polylines in the sensor frame [m],
+    for a rig of the given size [m]. legend: explains the shape.
+    """
+
+    sections: Callable[[Calibration], Iterable[Section]]
+    curves: Callable[[R], Iterable[ResidualCurve]] | None = None
+    clouds: Callable[[Calibration], Iterable[ResidualCloud]] = lambda _: ()
+    amounts: Callable[[Calibration], Iterable[str]] = lambda _: ()
+    shape: Callable[[Calibration, str, float], np.ndarray | None] = lambda *_: None
+    legend: str = ""

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.geometry.targets import Target, target_from_plain
+from icalib.kinds import presenters
 from icalib.report.figures import (
     AXIS_COLORS,
     COLORS,
@@ -25,7 +26,6 @@ from icalib.report.figures import (
 )
 from icalib.result import Calibration, joint_covariance
 from icalib.result.verdict import worst
-from icalib.sensors import SENSOR_KINDS, call_kind, facet
 
 
 def rig_picture(c: Calibration) -> Figure:
@@ -114,13 +114,12 @@ def spread_of(c: Calibration) -> float:
 
 def shape_of(c: Calibration, name: str) -> np.ndarray | None:
     """(n, 3) polylines of a sensor's shape in the sensor frame [m]; None if its kind has no shape."""
-    return call_kind(c.rig["sensors"][name]["type"], "show", "shape", c, name, spread_of(c))
+    return presenters()[c.rig["sensors"][name]["type"]].shape(c, name, spread_of(c))
 
 
 def legends(c: Calibration) -> list[str]:
     """Explanations of the shapes of all kinds of sensors in the rig."""
-    texts = (getattr(facet(kind, "show"), "LEGEND", "") for kind in SENSOR_KINDS if c.of_type(kind))
-    return [legend for legend in texts if legend]
+    return [p.legend for kind, p in presenters().items() if p.legend and c.of_type(kind)]
 
 
 def body_outline(target: Target, body: int) -> np.ndarray:

@@ -37,12 +37,15 @@ from icalib.result.verdict import UNUSABLE, RelativePose, joint_covariance, rela
 from icalib.rig import Rig, Settings
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.rig.rig import ONE
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
+from icalib.sensors.imu.stream import ImuResiduals
+from icalib.sensors.lidar.stream import LidarResiduals
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 from icalib.sensors.stream import Residuals, RowResiduals
 
 FORMAT, FORMAT_VERSION = "icalib result", 4
+RECORDS = (ImuResiduals, CornerResiduals, TrackResiduals, LidarResiduals)  # others are `RowResiduals`
 _TEXTS = ("unobservable", "warnings", "notes", "wrong")
 _PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
@@ -188,9 +191,9 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
 
 
 def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
-    """The residual record of one sensor and kind. Its class is the one that a sensor kind lists in RECORDS, by default
+    """The residual record of one sensor and kind. Its class is one of RECORDS, by default
     `RowResiduals`. `of` returns the arrays of a class under a prefix."""
-    classes = {record.kind: record for kind in SENSOR_KINDS for record in getattr(facet(kind, "record"), "RECORDS", ())}
+    classes = {record.kind: record for record in RECORDS}
     fields = _tuples(plain)
     record = classes.get(fields["kind"], RowResiduals)
     arrays = of(record, f"residuals/{fields['sensor']}/{fields['kind']}")

@@ -14,12 +14,13 @@ from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
 from icalib.geometry.targets import NoTarget, Target
 from icalib.rig.scene import SCENE
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.imu.spec import ImuSensor
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.parameter import ToleranceSetting, check_fields
 from icalib.sensors.pose.spec import PoseSensor
+from icalib.sensors.position.spec import PositionSensor
 from icalib.sensors.sensor import ROTATION, Sensor
 from icalib.sensors.wheels.spec import Wheels
 
@@ -265,7 +266,9 @@ def _several(value: Sensor | Iterable[Sensor] | None) -> tuple[Sensor, ...]:
 
 # Sensor classes by type, and the definitions of all parameters, collected from `SENSOR_KINDS` and `SCENE`.
 
-SENSOR_TYPES: dict[str, type[Sensor]] = {kind: facet(kind, "spec").SENSOR for kind in SENSOR_KINDS}
+SENSOR_TYPES: dict[str, type[Sensor]] = {
+    kind.sensor_type: kind for kind in (ImuSensor, Camera, Lidar, Wheels, PoseSensor, PositionSensor)
+}
 _SENSOR_SPECS = (spec for kind in SENSOR_TYPES.values() for spec in kind.parameters)
 ALL_SPECS = tuple(dict.fromkeys((*_SENSOR_SPECS, *SCENE)))  # without duplicates
 

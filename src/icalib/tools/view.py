@@ -24,15 +24,17 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry import so3
 from icalib.geometry.small import hermite
 from icalib.geometry.targets import target_from_plain
+from icalib.kinds import presenters
 from icalib.report import rig_figures
-from icalib.report.figures import AXIS_COLORS, COLORS, REJECTED, ResidualCloud, curves
+from icalib.report.figures import AXIS_COLORS, COLORS, REJECTED, curves
 from icalib.report.rig_figures import SIGMAS, VERDICT_COLORS, ellipsoids, magnification
 from icalib.result import Calibration, RecordingSpan, load_calibration
 from icalib.result.quantities import rows
-from icalib.rig import Rig
+from icalib.rig import Camera, ImuSensor, Lidar, Rig
 from icalib.rig.file import rig_from_dict
-from icalib.sensors import call_all_kinds, call_kind
-from icalib.sensors.sensor import Sensor
+from icalib.sensors.camera.read import image_sources, sees
+from icalib.sensors.imu.read import time_series
+from icalib.sensors.lidar.read import scans
 
 __all__ = ["view"]
 
@@ -257,15 +259,17 @@ class Recorded:
     def check(self) -> None:
         """Raises RecordingError if a sensor of the result is not in the recording."""
         for sensor in self.rig.sensors.values():
-            if not sensor.tracks_points or call_kind(sensor.sensor_type, "read", "sees", self.recording, sensor):
+            if not isinstance(sensor, Camera) or not sensor.tracks_points or sees(self.recording, sensor):
                 self.recording.where(sensor)
 
     def log(self, s: RerunStream, progress: Progress) -> list[str]:
         """Sends all data to Rerun, and returns sentences on data that were left out."""
         sensors = self.rig.sensors.values()
-        topics: dict[str, str] = dict(call_all_kinds("read", "image_sources", self.recording, self.rig))
-        work = [(sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in sensors if sensor.is_inertial]
-        work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in sensors if sensor.shows_planes]
+        topics = dict(image_sources(self.recording, self.rig))
+        work = [
+            (sensor.name, lambda x=sensor: self._readings(s, x)) for sensor in sensors if isinstance(sensor, ImuSensor)
+        ]
+        work += [(sensor.name, lambda x=sensor: self._scans(s, x)) for sensor in sensors if isinstance(sensor, Lidar)]
         work += [(name, lambda n=name, t=topic: self._images(s, n, t)) for name, topic in topics.items()]
         without_images = [x.name for x in sensors if x.lens and x.name not in topics]
         notes = [f"{name}: the recording holds no images of it." for name in without_images]
@@ -287,8 +291,8 @@ class Recorded:
             )
         return inside
 
-    def _readings(self, s: RerunStream, sensor: Sensor) -> list[str]:
-        stamps_ns, readings = call_kind(sensor.sensor_type, "read", "time_series", self.recording, sensor)
+    def _readings(self, s: RerunStream, sensor: ImuSensor) -> list[str]:
+        stamps_ns, readings = time_series(self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stamps_ns)
         inside = self._during(sensor.name, seconds)
         keep = inside[:: _stride(len(inside), MOST_READINGS)]
@@ -314,8 +318,8 @@ class Recorded:
         notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
-    def _scans(self, s: RerunStream, sensor: Sensor) -> list[str]:
-        stream: ScanPoints = call_kind(sensor.sensor_type, "read", "scans", self.recording, sensor)
+    def _scans(self, s: RerunStream, sensor: Lidar) -> list[str]:
+        stream = scans(self.recording, sensor)
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)
@@ -600,8 +604,7 @@ def log_target(s: RerunStream, c: Calibration) -> None:
 
 def log_planes(s: RerunStream, c: Calibration) -> None:
     """Sends the measured points that belong to planes, coloured by the size of their residuals."""
-    cloud: ResidualCloud
-    for cloud in call_all_kinds("show", "clouds", c):
+    for cloud in (cloud for presenter in presenters().values() for cloud in presenter.clouds(c)):
         of, size = c.recording_of(cloud.seconds), cloud.size
         top = _WORST_OF_SCALE * float(np.sqrt(np.mean(size**2))) if len(size) else 1.0
         for k, span in enumerate(spans(c)):

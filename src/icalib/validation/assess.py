@@ -24,6 +24,7 @@ from icalib.estimate.residual_statistics import (
     spread_variance,
 )
 from icalib.estimate.solver import Visit
+from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
 from icalib.observability.determination import Contradiction, Determined, Observability, observe
 from icalib.optim.arrowhead import restricted_inverse
@@ -44,7 +45,6 @@ from icalib.result import (
 from icalib.result.calibration import Timeline, row_record, versions
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
-from icalib.sensors import SENSOR_KINDS, call_all_kinds, facet
 from icalib.validation.causes import AssessedEstimate, all_causes, scatter_warnings
 from icalib.validation.guesses import guess_notes
 
@@ -54,7 +54,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
     that other faults of the estimate may follow from them."""
     estimate, rig = determined.estimate, inputs.rig
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
-    contradicting = tuple(call_all_kinds("assess", "inner_contradictions", inputs, estimate, segments))
+    contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
     changes = [change for _, change in contradicting]
     determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, *changes]))
     observability = _observed(inputs, determined, _column_names(inputs))
@@ -105,7 +105,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        planes=tuple(call_all_kinds("assess", "planes", inputs, outcome.state)),
+        planes=tuple(plane for a in assessors().values() for plane in a.planes(inputs, outcome.state)),
     )
 
 
@@ -121,7 +121,8 @@ def _notes(assessed: AssessedEstimate) -> Iterator[str]:
     """Notes on the recordings and sensors, on ambiguous parameters, and on wrong guesses."""
     inputs, estimate = assessed.inputs, assessed.estimate
     yield from notes(inputs, estimate, assessed.timeline)
-    yield from call_all_kinds("assess", "ambiguities", inputs, estimate, assessed.fits)
+    for assessor in assessors().values():
+        yield from assessor.ambiguities(inputs, estimate, assessed.fits)
     yield from guess_notes(inputs, assessed.groups)
 
 
@@ -270,16 +271,15 @@ def _node_recordings(inputs: Inputs, state: State, timeline: Timeline) -> np.nda
 
 def _keyframe_instants(inputs: Inputs, state: State) -> dict[str, np.ndarray]:
     """By the key of their stream: instants (M,) of measurements at which keyframes may lie, s on the joined clock."""
-    return dict(call_all_kinds("assess", "keyframe_instants", inputs, state))
+    return dict(pair for a in assessors().values() for pair in a.keyframe_instants(inputs, state))
 
 
 def _residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Residuals]:
     """Records of residuals for each sensor; a kind without records of a special form gives all rows of its factors."""
     outcome = estimate.outcome
-    for kind in SENSOR_KINDS:
-        assess_facet = facet(kind, "assess")
-        if hasattr(assess_facet, "residuals"):
-            yield from assess_facet.residuals(inputs, estimate, timeline)
+    for kind, assessor in assessors().items():
+        if assessor.residuals is not None:
+            yield from assessor.residuals(inputs, estimate, timeline)
             continue
         names = [s.name for s in inputs.rig.sensors.values() if s.sensor_type == kind]
         for key, factor in estimate.problem.factors.items():
@@ -293,8 +293,10 @@ def _warnings(inputs: Inputs, estimate: Estimate, groups: tuple[ParameterGroup, 
     if not estimate.outcome.converged:
         yield f"the solver did not converge: {estimate.outcome.status}"
     yield from inputs.measurements.warnings
-    yield from call_all_kinds("assess", "warnings", inputs, estimate)
-    yield from call_all_kinds("assess", "value_warnings", groups)
+    for assessor in assessors().values():
+        yield from assessor.warnings(inputs, estimate)
+    for assessor in assessors().values():
+        yield from assessor.value_warnings(groups)
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
@@ -314,7 +316,8 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
         timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
         yield f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}."
     yield from inputs.measurements.notes
-    yield from call_all_kinds("assess", "notes", inputs, estimate, timeline)
+    for assessor in assessors().values():
+        yield from assessor.notes(inputs, estimate, timeline)
 
 
 # Two-fold cross-validation, in the form of the result.

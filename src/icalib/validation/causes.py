@@ -15,6 +15,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Change, Segments, changes, rows_of, scatter
+from icalib.kinds import assessors
 from icalib.observability.determination import SIGMAS, Cause, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, relaxed
 from icalib.optim.state import Key
@@ -23,7 +24,6 @@ from icalib.result.calibration import Timeline
 from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ratio, times
 from icalib.result.verdict import AUXILIARY
 from icalib.rig import ImuSensor, Rig
-from icalib.sensors import call_all_kinds, facet
 from icalib.sensors.imu.assess import quiet_scatter
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.validation.guesses import (
@@ -96,7 +96,8 @@ def changing(
 ) -> Iterator[Cause]:
     """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
-    yield from call_all_kinds("assess", "clock_causes", inputs, estimate)
+    for assessor in assessors().values():
+        yield from assessor.clock_causes(inputs, estimate)
     causes = []
     if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
@@ -277,7 +278,7 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     """
     inputs, estimate = assessed.inputs, assessed.estimate
     stated, notes = _stated(assessed, against)
-    omitted = set(call_all_kinds("assess", "unreliable", inputs.rig, estimate.problem.factors))
+    omitted = {kind for a in assessors().values() for kind in a.unreliable(inputs.rig, estimate.problem.factors)}
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known = stated
@@ -306,9 +307,8 @@ def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tup
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
     causes += scale_causes(inputs, assessed.groups, size)
-    causes += call_all_kinds(
-        "assess", "causes", inputs, assessed.estimate, assessed.groups, factor, None if certain else relaxed_rig
-    )
+    for assessor in assessors().values():
+        causes += assessor.causes(inputs, assessed.estimate, assessed.groups, factor, None if certain else relaxed_rig)
     explained = {key for cause in causes for key in cause.explains}
     against = tuple(c for c in against if c.key not in explained)
     causes += _contradicted(assessed, against, scale, certain or given, relaxed_rig)
@@ -412,7 +412,7 @@ def misfit_causes(
 ) -> Iterator[Cause]:
     """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
-    yield from (Cause(sentence, 0.0) for sentence in call_all_kinds("assess", "many_rejected", sensor_fits))
+    yield from (Cause(sentence, 0.0) for a in assessors().values() for sentence in a.many_rejected(sensor_fits))
     misfit, scatter = Misfit.of(sensor_fits), _scatter_over_stated(inputs)
     noise = list(_noise_of_imu(inputs, sensor_fits, scatter))
     yield from noise
@@ -433,13 +433,7 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
     sensor = rig.sensors.get(f.sensor)
     if sensor is None:
         return None
-    assess_facet = facet(sensor.sensor_type, "assess")
-    if hasattr(assess_facet, "misfit"):
-        return assess_facet.misfit(sensor, f, is_noise)
-    if excess(f) == 1.0:
-        return None
-    advice = "state a larger one" if is_noise else "they are no white noise, so check its clock and its mount"
-    return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
+    return assessors()[sensor.sensor_type].misfit(sensor, f, is_noise)
 
 
 def _noise_of_imu(inputs: Inputs, sensor_fits: Sequence[SensorFit], scatter: Mapping[str, float]) -> Iterator[Cause]:
@@ -449,7 +443,7 @@ def _noise_of_imu(inputs: Inputs, sensor_fits: Sequence[SensorFit], scatter: Map
     if inputs.rig.imu is None or not imu_fits:
         return
     small = [f for f in imu_fits if is_small(f)]
-    overstated = tuple(call_all_kinds("assess", "overstated_noise", inputs.rig, sensor_fits))
+    overstated = tuple(s for a in assessors().values() for s in a.overstated_noise(inputs.rig, sensor_fits))
     if any(scatter[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
         scales = {kind: max(s, 1.0) for kind, s in scatter.items()}
         misfit = Misfit.of(sensor_fits)

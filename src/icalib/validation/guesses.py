@@ -14,12 +14,12 @@ from icalib.estimate.score_test import TargetSize, target_size
 from icalib.geometry import so3
 from icalib.geometry.small import is_near
 from icalib.initialize.initializer import is_contradicted
+from icalib.kinds import assessors
 from icalib.model.bodies import SIZE
 from icalib.observability.determination import Cause, Contradiction
 from icalib.result import ParameterGroup
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
-from icalib.sensors import call_kind
 from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import TRANSLATION
 
@@ -31,7 +31,7 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
         group, guess = groups_by_key.get((sensor.name, name)), parameter.value
         if group is None or guess is None or parameter.mode != "free" or {*UNUSABLE} & {*group.verdict}:
             continue
-        far = call_kind(sensor.sensor_type, "assess", "is_far_guess", sensor, name, groups_by_key)
+        far = assessors()[sensor.sensor_type].is_far_guess(sensor, name, groups_by_key)
         if far is None:
             far = is_contradicted(sensor.spec(name), guess, group.value)
         if far:
@@ -94,7 +94,7 @@ def looks_like(
                 return f" The focal length is {size:g} times that: was it of images of another size?"
     if sensor is None:
         return ""
-    return call_kind(sensor.sensor_type, "assess", "looks_like", sensor, name, value, estimate) or ""
+    return assessors()[sensor.sensor_type].looks_like(sensor, name, value, estimate)
 
 
 def _frames(value: np.ndarray, estimate: np.ndarray) -> str:
@@ -120,7 +120,7 @@ def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
     named = {c.key[0] for c in against}
     for sensor in inputs.rig.sensors.values():
         if sensor.name not in named:
-            yield from call_kind(sensor.sensor_type, "assess", "absurd", sensor, groups_by_key) or ()
+            yield from assessors()[sensor.sensor_type].absurd(sensor, groups_by_key)
 
 
 def stated_words(inputs: Inputs, c: Contradiction) -> str:
@@ -218,7 +218,7 @@ def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
     target = rig.has_target and any(s.sees_target for s in rig.mounted)
     has_imu = rig.imu is not None and not rig.imu.assumed
     sources = ["the size of the target"] if target else []
-    sensor_sources = (call_kind(sensor.sensor_type, "assess", "length", sensor, rig) for sensor in rig.mounted)
+    sensor_sources = (assessors()[sensor.sensor_type].length(sensor, rig) for sensor in rig.mounted)
     sources += [source for source in sensor_sources if source]
     if has_imu and (size is not None or not target):
         sources.append("the accelerometer")
@@ -245,5 +245,5 @@ def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetS
         "correct it in the rig file.",
         float(sum(a**2 for a in away.values())),
         True,
-        tuple((s.name, name) for s in sensors for name in call_kind(s.sensor_type, "assess", "sizes", s) or ()),
+        tuple((s.name, name) for s in sensors for name in assessors()[s.sensor_type].sizes(s)),
     )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icalib.report.figures import REJECTED, Figure, ResidualCurve, axis, dots, figure, line, numbers, thin
-from icalib.report.page import Html, Section, element, html, plot_place
+from icalib.report.page import Html, Presenter, Section, element, html, plot_place
 from icalib.report.rig_figures import PEN_UP
 from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.quantities import format_number
@@ -306,3 +306,12 @@ def map_words(m: ProjectionMap) -> str:
     )
     worse = size > UNOBSERVED_RATIO * m.median_seen and m.seen.any()
     return text + (" Let it see points there, too, and the lens is known there." if worse else "")
+
+
+PRESENTER = Presenter(
+    sections=sections,
+    curves=curves,
+    amounts=amounts,
+    shape=shape,
+    legend=LEGEND,
+)

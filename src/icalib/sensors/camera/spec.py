@@ -175,6 +175,3 @@ def _resolution(value: YamlValue) -> tuple[int, int]:
     if len(sides) != 2:
         value.fail(f"must be [width, height] in pixels, but has {len(sides)} entries.")
     return sides[0].whole(1), sides[1].whole(1)
-
-
-SENSOR = Camera

@@ -243,7 +243,6 @@ class TrackResiduals(_PointsInImages):
         return np.isfinite(self.residual[:, 0])
 
 
-RECORDS = (CornerResiduals, TrackResiduals)
 ImageResiduals = CornerResiduals | TrackResiduals
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
+from icalib.observability.assessor import Assessor
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
@@ -95,3 +96,10 @@ def quiet_scatter(seconds: np.ndarray, readings: np.ndarray) -> float:
         return np.nan
     squares = differences[: count * WINDOW].reshape(count, WINDOW, -1) ** 2 / comb(2 * ORDER, ORDER)
     return float(np.sqrt((np.quantile(squares.mean(axis=1), QUIET, axis=0)).mean() * step))
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    residuals=residuals,
+    notes=notes,
+)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from icalib.report.figures import Figure, ResidualCurve, thin
-from icalib.report.page import Section, plot_place
+from icalib.report.page import Presenter, Section, plot_place
 from icalib.report.rig_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
 from icalib.result import Calibration
 from icalib.sensors.imu.stream import ImuResiduals
@@ -36,3 +36,10 @@ def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
     """The curves of whitened residuals over time, for each block of three columns."""
     for b, block in enumerate(BLOCKS):
         yield ResidualCurve(block, r.seconds, r.whitened[:, 3 * b : 3 * b + 3], ("x", "y", "z"))
+
+
+PRESENTER = Presenter(
+    sections=sections,
+    curves=curves,
+    legend=LEGEND,
+)

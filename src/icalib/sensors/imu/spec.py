@@ -257,6 +257,3 @@ def _intrinsics(value: YamlValue) -> Parameter:
     if name == "fixed":
         return Parameter("fixed")
     return Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(name).sigma)
-
-
-SENSOR = ImuSensor

@@ -56,6 +56,3 @@ class ImuResiduals:
     def successive(self) -> dict[str, Successive]:
         """Pairs of residuals of successive intervals, for each block of `BLOCKS`."""
         return successive_rows(BLOCKS, self.whitened)
-
-
-RECORDS = (ImuResiduals,)

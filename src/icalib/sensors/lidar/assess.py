@@ -16,6 +16,7 @@ from icalib.estimate.problem import motion_of
 from icalib.geometry.planes import plane_of
 from icalib.motion.factor import of_type
 from icalib.motion.poses import instants, usable
+from icalib.observability.assessor import Assessor
 from icalib.optim.state import State
 from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
@@ -234,3 +235,13 @@ def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> str | None:
 def length(lidar: Lidar, rig: Rig) -> str | None:
     """The source of the scale, as text for messages."""
     return f"the ranges of {lidar.name}"
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    planes=planes,
+    residuals=residuals,
+    notes=notes,
+    warnings=warnings,
+    length=length,
+)

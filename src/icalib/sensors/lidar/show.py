@@ -20,7 +20,7 @@ from icalib.report.figures import (
     path_3d,
     thin,
 )
-from icalib.report.page import Html, Section, element, html, plot_place
+from icalib.report.page import Html, Presenter, Section, element, html, plot_place
 from icalib.report.rig_figures import CIRCLE, PEN_UP
 from icalib.result import Calibration, Plane
 from icalib.sensors.lidar.stream import LidarResiduals
@@ -203,3 +203,13 @@ def _level_axes(normal: np.ndarray) -> np.ndarray:
     length = float(np.linalg.norm(level))
     level = level / length if length > MIN_SLOPE else np.array([0.0, normal[2], -normal[1]]) / np.hypot(*normal[1:])
     return np.stack([level, np.cross(normal, level)])
+
+
+PRESENTER = Presenter(
+    sections=sections,
+    curves=curves,
+    clouds=clouds,
+    amounts=amounts,
+    shape=shape,
+    legend=LEGEND,
+)

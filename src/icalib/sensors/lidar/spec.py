@@ -85,6 +85,3 @@ def _point_time(fields: dict[str, YamlValue]) -> PointTime:
         if name in fields and chosen in ("azimuth", "snapshot"):
             fields[name].fail(f"point_time: {chosen} uses no point times; remove {name}, or point_time.")
     return chosen
-
-
-SENSOR = Lidar

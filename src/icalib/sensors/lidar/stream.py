@@ -94,6 +94,3 @@ class LidarResiduals:
         order = np.lexsort((self.seconds, self.plane))
         follows = (np.diff(self.plane[order]) == 0) & (np.diff(self.seconds[order]) < MAX_SUCCESSIVE_S)
         return {self.kind: Successive((self.residual[order] / self.sigma[order])[:, None], follows)}
-
-
-RECORDS = (LidarResiduals,)

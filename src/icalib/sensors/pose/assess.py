@@ -12,6 +12,7 @@ from icalib.estimate.inputs import Inputs, with_association
 from icalib.estimate.residual_statistics import Segments
 from icalib.estimate.score_test import LeftOut, score_test
 from icalib.motion.factor import Whitened, output_at, pairs_of
+from icalib.observability.assessor import Assessor
 from icalib.observability.determination import SIGMAS
 from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
@@ -153,3 +154,12 @@ def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:
 def length(sensor: PoseSensor, rig: Rig) -> str | None:
     """Words for the source of the metric scale."""
     return f"the positions of {sensor.name}"
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    notes=notes,
+    inner_contradictions=inner_contradictions,
+    warnings=warnings,
+    length=length,
+)

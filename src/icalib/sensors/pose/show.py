@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.report.page import Section, row_sections
+from icalib.report.page import Presenter, Section, row_sections
 from icalib.result import Calibration
 
 _SECTION_WORDS = (
@@ -16,3 +16,8 @@ _SECTION_WORDS = (
 def sections(c: Calibration) -> Iterator[Section]:
     """One section with the residuals of each pose sensor."""
     yield from row_sections(c, "pose", "poses", "Residuals of pose sensors", _SECTION_WORDS)
+
+
+PRESENTER = Presenter(
+    sections=sections,
+)

@@ -170,6 +170,3 @@ def _frames(value: YamlValue) -> tuple[str, str]:
     if len(names) != 2 or names[0].lstrip("/") == names[1].lstrip("/"):
         value.fail("must name two frames, the parent and the child, as in [base_link, tool0]; correct it.")
     return names[0], names[1]
-
-
-SENSOR = PoseSensor

@@ -9,6 +9,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.motion.factor import Whitened, pairs_of
+from icalib.observability.assessor import Assessor
 from icalib.result import RowResiduals, SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation, row_record
 from icalib.result.quantities import excess, times
@@ -115,3 +116,12 @@ def length(sensor: PositionSensor, rig: Rig) -> str | None:
     """The measurements of this sensor that make the metric scale observable, as words of a sentence."""
     del rig
     return f"the positions of {sensor.name}"
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    residuals=residuals,
+    notes=notes,
+    warnings=warnings,
+    length=length,
+)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.report.figures import COLORS, Figure, axis, dots, figure, line, thin
-from icalib.report.page import Html, Section, element, plot_place, row_sections
+from icalib.report.page import Html, Presenter, Section, element, plot_place, row_sections
 from icalib.result import Calibration, RowResiduals
 
 OUTLIER_SIGMA = 3.0  # standard deviations: white noise exceeds it in 1 of 34 fixes (chi, three degrees of freedom)
@@ -55,3 +55,9 @@ def _map(c: Calibration, r: RowResiduals) -> Figure:
         dots(x, y, f"{len(off)} of {len(r.seconds)} fixes, off by more than {OUTLIER_SIGMA:g} sigma", COLORS[1], 7),
     ]
     return figure(traces, 480, xaxis=axis("x [m]"), yaxis=axis("y [m]", scaleanchor="x"))
+
+
+PRESENTER = Presenter(
+    sections=sections,
+    amounts=amounts,
+)

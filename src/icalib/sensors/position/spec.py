@@ -119,6 +119,3 @@ class PositionSensor(ClockedSensor):
 def _noise(value: YamlValue) -> float | Literal["messages"]:
     is_text = not (value.is_list or value.is_mapping) and value.text() == MESSAGES
     return MESSAGES if is_text else value.positive()
-
-
-SENSOR = PositionSensor

@@ -11,7 +11,8 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry.small import is_near
 from icalib.initialize.initializer import level_sensor
 from icalib.motion.factor import of_type, pairs_of
-from icalib.result import ParameterGroup, RowResiduals, SensorFit
+from icalib.observability.assessor import Assessor, Groups
+from icalib.result import RowResiduals, SensorFit
 from icalib.result.calibration import Timeline, row_record
 from icalib.result.quantities import excess, times
 from icalib.rig import Rig, Wheels
@@ -161,7 +162,7 @@ def sizes(wheels: Wheels) -> tuple[str, ...]:
     return (wheels.drive_specs[0].name,)
 
 
-def absurd(wheels: Wheels, groups: dict[tuple[str, str], ParameterGroup]) -> Iterator[str]:
+def absurd(wheels: Wheels, groups: Groups) -> Iterator[str]:
     """A sentence if the ratio of radius to baseline is implausible, as for readings in a wrong unit."""
     if wheels.kind != "pair":
         return
@@ -193,3 +194,15 @@ def looks_like(wheels: Wheels, name: str, value: np.ndarray, estimated: np.ndarr
         if is_near(estimated, factor * value, UNIT_TOLERANCE):
             return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    residuals=residuals,
+    notes=notes,
+    warnings=warnings,
+    length=length,
+    sizes=sizes,
+    absurd=absurd,
+    looks_like=looks_like,
+)

@@ -11,7 +11,7 @@ import numpy as np
 from icalib.data.images import Note
 from icalib.data.measurements import WheelStream
 from icalib.data.messages import HasMessages, MessageType, TopicInfo, TwistStream, all_messages, read_twists
-from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import kept_readings, longest_run, usual_step
 from icalib.data.tables import STAMP, Table, TableFile, TableKind, holds, read_table
 from icalib.errors import RecordingError
@@ -680,3 +680,6 @@ def range_of(angles: np.ndarray) -> float | None:
 def without_wraps(step: np.ndarray, size: float) -> np.ndarray:
     """Unwrapped steps of angles or counts that wrap around after `size`: the shorter of both directions."""
     return step - size * np.round(step / size)
+
+
+READER = Reader(MESSAGES, TABLES, read, source)

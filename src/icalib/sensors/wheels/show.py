@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from icalib.report.page import Section, row_sections
+from icalib.report.page import Presenter, Section, row_sections
 from icalib.report.rig_figures import CIRCLE, PEN_UP
 from icalib.result import Calibration
 
@@ -47,3 +47,11 @@ def axle(c: Calibration, name: str) -> np.ndarray:
     for hub, (circle, ends) in zip((left, right), discs, strict=True):
         pen += [circle, PEN_UP, *(np.stack([hub, end, PEN_UP[0]]) for end in ends)]
     return np.vstack(pen)
+
+
+PRESENTER = Presenter(
+    sections=sections,
+    amounts=amounts,
+    shape=shape,
+    legend=LEGEND,
+)

@@ -362,6 +362,3 @@ def _ground_to_plain(ground: Ground) -> dict[str, Any]:
     fields = [name for name in _GROUND if name == "tilt_noise" or ground.height_sigma is not None]
     plain = {name: getattr(ground, name) for name in ("plane", *fields)}
     return {name: value for name, value in plain.items() if value is not None}
-
-
-SENSOR = Wheels

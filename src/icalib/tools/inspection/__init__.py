@@ -20,6 +20,7 @@ from icalib.base.yaml_nodes import read_yaml
 from icalib.data.recordings import Recording, TopicInfo, open_recording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import Scene
+from icalib.kinds import inspectors
 from icalib.rig.file import load_rig, load_target
 from icalib.tools.inspection.facts import (
     Finding,
@@ -34,7 +35,6 @@ from icalib.tools.inspection.facts import (
     findings,
     independent,
     inertial,
-    inspectors,
     moves_on_floor,
     moves_without_imu,
     moving,

@@ -16,7 +16,8 @@ from rich.text import Text
 
 from icalib.base.files import json_text
 from icalib.geometry.targets import Scene
-from icalib.tools.inspection.facts import Inspection, StreamFacts, inspectors, named, plain
+from icalib.kinds import inspectors
+from icalib.tools.inspection.facts import Inspection, StreamFacts, named, plain
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
 _ANSWERS = {

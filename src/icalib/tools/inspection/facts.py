@@ -26,7 +26,7 @@ from icalib.data.stamps import longest_part
 from icalib.data.tables import table_files
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
-from icalib.sensors import SENSOR_KINDS, facet
+from icalib.kinds import inspectors
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.kalibr import KalibrFiles
 
@@ -341,12 +341,6 @@ class KindInspector:
     def notes(self, inspection: Inspection) -> Iterator[str]:
         """Notes on the search for the target, for the terminal."""
         yield from ()
-
-
-def inspectors() -> dict[str, KindInspector]:
-    """The inspectors by type of the sensor in a rig file, in the order of `SENSOR_KINDS`."""
-    modules = {kind: facet(kind, "inspect") for kind in SENSOR_KINDS}
-    return {kind: module.INSPECTOR for kind, module in modules.items() if module is not None}
 
 
 @cache

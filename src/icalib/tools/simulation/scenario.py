@@ -14,8 +14,8 @@ import numpy as np
 from icalib.base.yaml_nodes import YamlValue
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
+from icalib.kinds import simulated_kinds
 from icalib.rig import ImuNoise
-from icalib.sensors import SENSOR_KINDS, facet
 from icalib.sensors.camera.spec import BLOOM, DISTORTION, INTRINSICS
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
@@ -128,12 +128,6 @@ class SimSensor(ABC):
     def bag_topic(self, stream: Any, offset_ns: int) -> BagTopic | str:
         """The messages that the sensor's driver would send, or a sentence if it has none. offset_ns: to be added to the
         sensor's stamps to get the IMU's clock [ns]."""
-
-
-def simulated_kinds() -> dict[str, type[SimSensor]]:
-    """Classes of simulated sensors by their type in the rig file, in the order of `SENSOR_KINDS`."""
-    modules = {kind: facet(kind, "simulate") for kind in SENSOR_KINDS}
-    return {kind: module.SIMULATED for kind, module in modules.items() if module is not None}
 
 
 # Refuses scenarios whose measurements do not fit in memory: the simulator keeps all of them.

@@ -14,6 +14,7 @@ from icalib.base.files import NAME, NAME_WORDS
 from icalib.base.yaml_nodes import LARGEST_INTEGER, YamlValue, read_yaml
 from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS, AprilGrid, Markers, Scene, Target
+from icalib.kinds import simulated_kinds
 from icalib.rig import ImuNoise
 from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.fields import choice_or
@@ -34,7 +35,6 @@ from icalib.tools.simulation.scenario import (
     read_effects,
     refuse_large,
     share,
-    simulated_kinds,
     triple,
 )
 from icalib.tools.simulation.trajectory import Drive, DriveKind, Features

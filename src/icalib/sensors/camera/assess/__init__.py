@@ -13,6 +13,7 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.poses import instants, usable
+from icalib.observability.assessor import Assessor
 from icalib.observability.determination import Cause
 from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import State
@@ -30,23 +31,6 @@ from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.sensor import ROTATION, TRANSLATION
-
-__all__ = [
-    "ambiguities",
-    "causes",
-    "clock_causes",
-    "is_far_guess",
-    "keyframe_instants",
-    "length",
-    "many_rejected",
-    "misfit",
-    "notes",
-    "overstated_noise",
-    "residuals",
-    "unreliable",
-    "value_warnings",
-    "warnings",
-]
 
 LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges by about a third of it
 
@@ -474,3 +458,21 @@ def _seconds(estimate: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) instants [s] of the images of camera `index`, on the time axis of the result."""
     stream = of_type(estimate.problem.factors, CornerFactor)[index].stream
     return timeline.on_result_clock(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
+
+
+ASSESSOR = Assessor(
+    misfit=misfit,
+    residuals=residuals,
+    keyframe_instants=keyframe_instants,
+    notes=notes,
+    ambiguities=ambiguities,
+    warnings=warnings,
+    value_warnings=value_warnings,
+    causes=causes,
+    clock_causes=clock_causes,
+    unreliable=unreliable,
+    many_rejected=many_rejected,
+    overstated_noise=overstated_noise,
+    length=length,
+    is_far_guess=is_far_guess,
+)

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.data.images import Note, ignore
 from icalib.data.messages import HasMessages, MessageType, UnreadType
-from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import rate_sentence
 from icalib.data.tables import STAMP, TableFile, TableKind, read_table
 from icalib.errors import RecordingError
@@ -301,3 +301,6 @@ def _check(stream: TrackStream, what: str) -> None:
         raise RecordingError(
             f"{what}: no feature is in more than one image; a point keeps its number from image to image."
         )
+
+
+READER = Reader(MESSAGES, TABLES, read, source, UNREAD, needs_detection)

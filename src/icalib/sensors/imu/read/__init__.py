@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from icalib.data.messages import MessageType, TopicInfo, choose_topic
-from icalib.data.recording import Cut, Reading, ReadStream, Recording
+from icalib.data.recording import Cut, Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import ClockJumps, kept_readings, longest_run
 from icalib.data.tables import STAMP, TableFile, TableKind, holds, in_axes, read_table, vector_names
 from icalib.errors import RecordingError
@@ -421,3 +421,6 @@ def saturations(imu: ImuStream) -> tuple[Saturation, ...]:
                 if abs(limit) >= _NARROWEST_RANGE[kind] and count >= _SATURATED_RUN:
                     runs.append(Saturation(kind, name, float(limit), count, int(imu.stamps_ns[at])))
     return tuple(runs)
+
+
+READER = Reader(MESSAGES, TABLES, read, source)

@@ -11,7 +11,7 @@ import numpy as np
 
 from icalib.base.files import HEAD_BYTES, load_arrays, not_data
 from icalib.data.messages import MessageType, TopicInfo, UnreadType
-from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.tables import TableFile
 from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.point_clouds import (
@@ -190,3 +190,6 @@ def _of_kind(path: Path, name: str, array: np.ndarray, kind: type[np.generic]) -
             "correct the program that writes it."
         )
     return np.ascontiguousarray(array, dtype=kind)
+
+
+READER = Reader(MESSAGES, TABLES, read, source, UNREAD)

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.data.measurements import PoseStream
 from icalib.data.messages import MessageType, TopicInfo, read_poses
-from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import kept_readings, stands_still_between
 from icalib.data.tables import TableFile, holds
 from icalib.errors import RecordingError
@@ -245,3 +245,6 @@ def _refuse_units(read: PoseReadings, what: str) -> None:
 def _sizes(vectors: np.ndarray) -> np.ndarray:
     """(n,) norms of vectors (n, 3)."""
     return np.linalg.norm(vectors, axis=1)
+
+
+READER = Reader(MESSAGES, TABLES, read, source)

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from icalib.data.images import Note, ignore
 from icalib.data.messages import TopicInfo
-from icalib.data.recording import Reading, ReadStream, Recording
+from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import kept_readings, true_runs
 from icalib.data.tables import TableFile, named
 from icalib.errors import RecordingError
@@ -327,3 +327,6 @@ def steps(t: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     limit = max(MIN_STEP_M, MIN_STEP_M_S2 * typical**2, MAX_MEDIAN_DISTANCES * float(np.median(size)))
     before = np.flatnonzero((size > limit) & (dt < MAX_GAP_STEPS * typical))
     return before + 1, beyond[before]
+
+
+READER = Reader(MESSAGES, TABLES, read, source)
