@@ -105,3 +105,8 @@ def test_a_refusal_is_recorded_without_the_folder_of_the_case(golden: Any, bench
     cases = benchmark_program("golden_cases").CASES
     first, second = (golden.record_case(cases["wrong-rig-file"], tmp_path) for _ in range(2))
     assert first.refusal == second.refusal and first.refusal.startswith("rig.yaml")
+
+
+def test_each_case_is_stored(benchmark_program):
+    stored = {file.stem for file in benchmark_program("golden").FOLDER.glob("*.json")}
+    assert stored == set(benchmark_program("golden_cases").CASES)
