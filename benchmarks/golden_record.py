@@ -18,8 +18,7 @@ from golden_cases import Case, Inputs, case_folder
 from icalib.cli.console import print_result
 from icalib.data.measurements import Measurements
 from icalib.errors import CalibrationError
-from icalib.export.formats import FORMATS, export
-from icalib.export.outputs import output_files
+from icalib.export.formats import FORMATS, export, output_files
 from icalib.pipeline import calibrate_measurements, measure
 from icalib.result import Calibration
 from icalib.rig import Rig

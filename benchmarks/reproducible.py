@@ -109,10 +109,10 @@ def _other_eigenvectors() -> None:
 
 def _other_guess() -> None:
     """Moves the state and the guess from which the estimate starts."""
-    from icalib.estimate.problem.guess_priors import guess_sigma
-    from icalib.initialize import attempts
+    from icalib.estimate.problem import guess_sigma
+    from icalib.initialize import rig_guess
 
-    determine = attempts.determine
+    determine = rig_guess.determine
 
     def moved(inputs: Any, start: Any, guess: Any = None, *rest: Any) -> Any:
         signs = np.random.default_rng(1).choice((-1.0, 1.0), inputs.layout.size)
@@ -124,7 +124,7 @@ def _other_guess() -> None:
         guessed = replace(start, values=start.values | (guess or {})).retract(inputs.layout, still, step)
         return determine(inputs, start.retract(inputs.layout, still, step), guessed.values, *rest)
 
-    attempts.determine = moved
+    rig_guess.determine = moved
 
 
 def _in_subprocess(chosen: list[Any], variant: str, data: Path) -> Record | None:
