@@ -32,8 +32,8 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-from golden import Record, changed, record_of
-from golden_cases import CASES, ROOT, Case
+from golden_cases import CASES, ROOT, Case, Inputs
+from golden_record import Record, changed, record_case
 
 GUESS_SHARE = 0.3
 VALUE_BOUND, STD_BOUND = 0.01, 0.01
@@ -69,15 +69,8 @@ def main() -> int:
 
 
 def _given(rig_file: Path, recording: Path) -> Case:
-    from icalib.data.recordings import open_recording
-    from icalib.pipeline import measure
-    from icalib.rig.file import load_rig
-
-    def case(_: Path) -> Any:
-        rig = load_rig(rig_file)
-        return rig, measure(rig, open_recording(recording))
-
-    return case
+    given = Inputs(rig_file.absolute(), [recording.absolute()])
+    return lambda: given
 
 
 def _run(case: Case, variant: str) -> Record:
@@ -87,7 +80,7 @@ def _run(case: Case, variant: str) -> Record:
     if variant == "guess":
         _other_guess()
     data = Path(os.environ.get("ICALIB_DATA", ROOT.parent / "shared" / "data"))
-    return record_of(*case(data))
+    return record_case(case, data)
 
 
 def _other_eigenvectors() -> None:
