@@ -1,4 +1,4 @@
-"""Recordings that are folders: tables such as `imu0/data.csv` and `cam0/corners.csv` (also gzip), images, videos."""
+"""A folder of tables, images and videos as a recording."""
 
 from __future__ import annotations
 
@@ -45,6 +45,8 @@ from icalib.data.tables import (
 from icalib.errors import RecordingError
 from icalib.rig import PLAIN_TABLE, TableLayout
 from icalib.sensors.sensor import Sensor
+
+# Recordings that are folders: tables such as `imu0/data.csv` and `cam0/corners.csv` (also gzip), images, videos.
 
 _MAX_LISTED = 12
 _OF_IMAGES = ("data.csv", "data.csv.gz")  # tables of stamps, in folders with images
@@ -289,7 +291,6 @@ class PictureFolder(Recording):
         """None: the recording has no tables."""
 
     def table(self, sensor: Sensor, path: str, field: str = "path") -> Path:
-        del field
         name, (folder, *_) = sensor.name, _topics(self.root)
         if stamped_by_name(pictures_in(self.root / folder)):
             raise RecordingError(

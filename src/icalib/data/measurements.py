@@ -1,7 +1,4 @@
-"""`Measurements`: the sensor streams of one recording.
-
-Checks that measurements made in memory have a stream for each sensor of the rig. Readers of files ensure this.
-"""
+"""The streams of all sensors of a recording, and of several recordings as one."""
 
 from __future__ import annotations
 
@@ -19,6 +16,10 @@ from icalib.sensors.pose.stream import PoseStream
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.sensors.stream import S, Stream
 from icalib.sensors.wheels.stream import WheelPoses, WheelStream
+
+# `Measurements`: the sensor streams of one recording.
+#
+# Checks that measurements made in memory have a stream for each sensor of the rig. Readers of files ensure this.
 
 __all__ = [
     "CornerStream",

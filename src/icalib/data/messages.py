@@ -1,8 +1,4 @@
-"""Topics of a recording, and the choice of the topic of each sensor.
-
-Each kind of sensor declares its data formats in its `read` module. `MESSAGES` lists ROS message types, `UNREAD` types
-that icalib cannot read, and `TABLES` files of a folder (`data.tables.files`). Several kinds may declare the same type.
-"""
+"""Topics of a recording, types of messages, and the choice of the topic of each sensor."""
 
 from __future__ import annotations
 
@@ -17,6 +13,12 @@ import numpy as np
 
 from icalib.errors import RecordingError
 from icalib.kinds import readers
+
+# Topics of a recording, and the choice of the topic of each sensor.
+#
+# Each kind of sensor declares its data formats in its `read` module. `MESSAGES` lists ROS message types, `UNREAD`
+# types that icalib cannot read, and `TABLES` files of a folder (`data.tables.files`). Several kinds may declare the
+# same type.
 
 _MAX_LISTED = 20
 

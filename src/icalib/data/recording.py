@@ -76,13 +76,11 @@ class Recording(ABC):
         rejected with a note. Raises RecordingError if the topic is missing or not of `kind` (`TopicInfo.kind`), or if
         all messages are damaged. This default is for recordings without messages, and raises.
         """
-        del convert
         raise RecordingError(f"{self.root} holds no messages, and {topic} should have some of {kind}; give a bag.")
 
     def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
         """(N,) indices that sort readings by stamp, with a note. This default, for formats with sorted data, changes
         nothing."""
-        del topic
         return np.arange(len(stamps_ns))
 
     @abstractmethod

@@ -1,4 +1,4 @@
-"""One file for each kind of target: from a grey image to its corners."""
+"""From a grey image to the corners of a target, and why no target was found."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, M
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
 # Chooses the detector of each target.
+
+# One file for each kind of target: from a grey image to its corners.
 
 _SAME_PX = 3.0  # corners closer together are the same
 

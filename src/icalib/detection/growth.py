@@ -1,8 +1,4 @@
-"""Kernels that find further tags of a grid at the positions predicted by tags already found.
-
-Kernels that refine the corners of many tags at once, and measure the quality of each corner. Consistency checks:
-whether tags and corners lie where their neighbours predict them.
-"""
+"""Tags and squares of a grid at the positions predicted by those already found."""
 
 from __future__ import annotations
 
@@ -30,6 +26,11 @@ from icalib.detection.edge_model import END_PX, LEAST_RISE, USUAL_BLUR_PX, fit_c
 from icalib.detection.saddles import LEAST_WINDOW_PX, MARGIN_BLURS, crossing_contrast, find_saddle, fit_crossing
 from icalib.detection.tags import LEAST_CONTRAST, shortest_side
 from icalib.geometry.planes import EDGE
+
+# Kernels that find further tags of a grid at the positions predicted by tags already found.
+#
+# Kernels that refine the corners of many tags at once, and measure the quality of each corner. Consistency checks:
+# whether tags and corners lie where their neighbours predict them.
 
 _NEIGHBOURS = 3  # tags that predict another, none farther than two rows or columns
 _LEAST_VISIBLE_CELLS = 12  # visible data cells of a tag that the image border cuts, at least

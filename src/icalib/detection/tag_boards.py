@@ -1,8 +1,4 @@
-"""AprilGrids: tags are decoded, further tags are found from these, corners are refined and compared with their
-neighbours.
-
-Free markers: tags of a family that are surrounded by white, with four L-corners each.
-"""
+"""Corners of AprilGrids and ChArUco boards in an image."""
 
 from __future__ import annotations
 
@@ -29,6 +25,11 @@ from icalib.detection.growth import (
 from icalib.detection.tags import Family, ImageWithQuads, Tags, find_tags, tag_family, tags_at
 from icalib.errors import RecordingError
 from icalib.geometry.targets.families import APRILGRID_FAMILY
+
+# AprilGrids: tags are decoded, further tags are found from these, corners are refined and compared with their
+# neighbours.
+#
+# Free markers: tags of a family that are surrounded by white, with four L-corners each.
 
 # corners of a tag in OpenCV's order, in tag sizes
 _ON_BOARD = np.array([(1.0, 0.0), (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)])

@@ -1,4 +1,4 @@
-"""The least-squares problem of one pass, from rig and data, and its solution."""
+"""The least-squares problem of one pass, from rig and data: factors, layout, frames held, priors."""
 
 from __future__ import annotations
 
@@ -44,6 +44,9 @@ from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION
 
 # The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (iCalib paper
 # (15)).
+
+
+# The least-squares problem of one pass, from rig and data, and its solution.
 
 
 @runtime_checkable

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on the manifold: the loop over steps, and early stopping."""
+"""Levenberg-Marquardt on the manifold: options, damping, the loop over steps, its outcome."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from icalib.optim.arrowhead import (
 from icalib.optim.state import State
 
 # Options of the solver: when it ends, when it stops early, and what it reports.
+
+# Levenberg-Marquardt on the manifold: the loop over steps, and early stopping.
 
 # A decrease of half the chi^2 by 5e-4 is a step of at most 0.03 standard deviations, in any direction.
 CONVERGED_DECREASE = 5e-4

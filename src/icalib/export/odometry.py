@@ -1,7 +1,5 @@
-"""Export to OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, the file names in its configuration.
-
-Export to MINS: the calibrated fields of its configuration.
-"""
+"""Export to programs for visual-inertial and LiDAR-inertial odometry: OpenVINS, MINS, ORB-SLAM3, VINS-Fusion, FAST-LIO,
+FAST-LIVO2 and LIO-SAM."""
 
 from __future__ import annotations
 
@@ -34,6 +32,10 @@ from icalib.export.kalibr import KALIBR_NOISE, cam_overlaps, lower
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.result import Calibration
+
+# Export to OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, the file names in its configuration.
+#
+# Export to MINS: the calibrated fields of its configuration.
 
 HEAD = "%YAML:1.0\n"
 MODELS = {"pinhole-radtan": "radtan", "pinhole-equidistant": "equidistant"}

@@ -1,7 +1,4 @@
-"""Export to ROS 2: a launch file of static transforms, and CameraInfo files for camera_info_manager.
-
-Export to Autoware: `sensor_kit_calibration.yaml`, and `sensors_calibration.yaml` if wheels define base_link.
-"""
+"""Export to ROS 2: static transforms and CameraInfo files, and joints of a URDF."""
 
 from __future__ import annotations
 
@@ -36,6 +33,10 @@ from icalib.export.common import (
 from icalib.geometry.so3 import rpy
 from icalib.result import Calibration
 from icalib.sensors.fields import rotation_of_rpy
+
+# Export to ROS 2: a launch file of static transforms, and CameraInfo files for camera_info_manager.
+#
+# Export to Autoware: `sensor_kit_calibration.yaml`, and `sensors_calibration.yaml` if wheels define base_link.
 
 _DISTORTION = {
     "pinhole-radtan": "plumb_bob",

@@ -1,11 +1,4 @@
-"""Hand-eye calibration: extrinsics of a pose sensor on a body, from poses of both at the same instants.
-
-    T_world_body(i) T_body_sensor = T_world_frame T_frame_sensor(i)
-
-The rotation starts from relative rotations between pairs of instants (Park and Martin, IEEE Trans. Robotics and
-Automation, 1994). If these are all about one axis, or there are none, it starts from relative translations as well. All
-twelve unknowns follow by robust Gauss-Newton. Nothing is assumed about the motion between instants.
-"""
+"""Closed-form alignment of two motions: hand-eye rotation, lever arm, and regression of rates."""
 
 from __future__ import annotations
 
@@ -28,6 +21,14 @@ from icalib.initialize.rate_correlation import (
 )
 from icalib.motion.factor import Extrinsics, Frame, absolute_residuals
 from icalib.motion.imu_data import ImuData, clear_of
+
+# Hand-eye calibration: extrinsics of a pose sensor on a body, from poses of both at the same instants.
+#
+#     T_world_body(i) T_body_sensor = T_world_frame T_frame_sensor(i)
+#
+# The rotation starts from relative rotations between pairs of instants (Park and Martin, IEEE Trans. Robotics and
+# Automation, 1994). If these are all about one axis, or there are none, it starts from relative translations as well.
+# All twelve unknowns follow by robust Gauss-Newton. Nothing is assumed about the motion between instants.
 
 MAX_HAND_EYE_PAIRS = 2000  # pairs of instants between which motions are compared; bounds the time
 # Singular values of the rotation vectors, second over first: below, the second axis may be noise

@@ -1,4 +1,4 @@
-"""Steps that initial guesses of several kinds of sensors share."""
+"""How a kind of sensor takes part in the initial guess, and steps that guesses of several kinds share."""
 
 from __future__ import annotations
 
@@ -39,6 +39,8 @@ from icalib.sensors.sensor import MOUNTED_NAMES, TRANSLATION
 # Increments span a whole spacing h, and their noise grows with sqrt(h).
 #
 # The upward direction: by gravity, or by a level frame of a sensor if gravity is not observed.
+
+# Steps that initial guesses of several kinds of sensors share.
 
 S = TypeVar("S", bound=Sensor)
 Values = dict[Key, np.ndarray]
@@ -82,7 +84,6 @@ class Initializer(Generic[S]):
     def motion_rank(self, rig: Rig) -> int | None:
         """Rank of this kind among those that show the motion of `rig`; the smallest is preferred. None if it does not
         show the motion."""
-        del rig
         return None
 
     def sources(self, rig: Rig) -> tuple[str, ...]:
@@ -105,13 +106,11 @@ class Initializer(Generic[S]):
     def adopted(self, inputs: Inputs, source_inputs: Inputs) -> Inputs:
         """`inputs`, the inputs of all sensors, with the changes that `refined` made in `source_inputs`, the inputs of
         `sources`."""
-        del source_inputs
         return inputs
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[S]) -> Values:
         """Calibration parameters of `sensors` and of their frames: values of the rig file, or values that align them to
         the trajectory in `state`. Raises EstimationError if neither determines them."""
-        del inputs, state, sensors
         return {}
 
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -121,7 +120,6 @@ class Initializer(Generic[S]):
 
     def unambiguous(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
         """The recordings with measurements of this kind that had several interpretations resolved to one."""
-        del rig
         return recordings
 
     def cleaned(self, recording: Measurements) -> Measurements:
@@ -131,7 +129,6 @@ class Initializer(Generic[S]):
     def vertical(self, state: State, sensor: S) -> np.ndarray | None:
         """Unit vector (3,) in the world that points upwards, if the frame of the sensor's measurements is level; else
         None."""
-        del state, sensor
         return None
 
     # Without an IMU
@@ -144,38 +141,32 @@ class Initializer(Generic[S]):
 
     def fixes(self, recording: Measurements) -> list[Fixes]:
         """Horizontal positions of points of the body, one item a sensor, if sensors of this kind measure them."""
-        del recording
         return []
 
     def check_moving(self, recording: Measurements) -> None:
         """Raises EstimationError if sensors of this kind measure too rarely to show a motion."""
-        del recording
 
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> InitialGuess | None:
         """The whole initial guess if all measurements were taken at rest, so that no motion is assumed; else None.
         body_poses, values: results of `body_poses`."""
-        del rig, recordings, body_poses, values
         return None
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         """The largest spacing of keyframes [s] at which the error of the assumed motion is small against the noise of
         sensors of this kind."""
-        del rig, recordings, motion
         return np.inf
 
     def rewritten(self, rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
         """Versions of the recordings in which measurements of `sources` are converted from another convention, each
         with a sentence that names the convention. They are tried if other sensors contradict the motion."""
-        del rig, recordings
         return iter(())
 
     # Errors
 
     def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
         """A context in which errors name the parameters that these sensors do not show, if they give the motion."""
-        del inputs
         return nullcontext()
 
     def explained(
@@ -183,7 +174,6 @@ class Initializer(Generic[S]):
     ) -> EstimationError | None:
         """The error that explains why the estimate broke down, if the cause is known; else None. converges: whether the
         estimate of a changed rig converges."""
-        del rig, recordings, converges
         return None
 
 

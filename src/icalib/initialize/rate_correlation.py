@@ -1,8 +1,4 @@
-"""Time offsets between a sensor and the IMU, by cross-correlation of the norms of their angular rates.
-
-The lag between two signals: masked, normalised cross-correlation over all shifts, by FFT (Padfield, IEEE Trans. Image
-Processing, 2012).
-"""
+"""Time offsets from angular rates: correlation of their size, then rotation angles between instants."""
 
 from __future__ import annotations
 
@@ -15,6 +11,11 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.motion.imu_data import SAME_INSTANT_S, ImuData, clear_of
+
+# Time offsets between a sensor and the IMU, by cross-correlation of the norms of their angular rates.
+#
+# The lag between two signals: masked, normalised cross-correlation over all shifts, by FFT (Padfield, IEEE Trans.
+# Image Processing, 2012).
 
 CORRELATION_GRID_HZ = 100.0  # of the grid: offsets are found to 5 ms
 MAX_RATE_STEP_S = 0.25  # s: longest step between neighbours that gives an angular rate, unless the stream is slower

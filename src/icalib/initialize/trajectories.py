@@ -309,7 +309,6 @@ def system_from_trajectory(
 
     def rows(R_is: np.ndarray, p_is: np.ndarray) -> LeverArmRows:
         """First (hand-eye) equation of the module, linearised at R_is; it is linear in p_imu_sensor."""
-        del p_is
         R = R_imu[i] @ R_is
         A = np.concatenate([R @ hat_u, R_imu[j] - R_imu[i]], axis=2)
         displacement = np.einsum("nij,nj->ni", R, u)

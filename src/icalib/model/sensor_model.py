@@ -78,24 +78,20 @@ class SensorModel(Generic[S, N]):
 
     def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies | None:
         """Bodies of the target that measurements of this kind connect; None for kinds that see no target."""
-        del rig, recordings
         return None
 
     def prepared(self, rig: Rig, bodies: Bodies, recording: Measurements) -> Measurements:
         """The recording with its streams of this kind as factors need them: with `bodies` of the target alone."""
-        del rig, bodies
         return recording
 
     # Parameters
 
     def takes_part(self, sensor: S, association: PlaneAssociation) -> bool:
         """Whether the sensor has parameters and factors. association: LiDAR points on planes."""
-        del sensor, association
         return True
 
     def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
         """Whether a parameter group of the sensor is estimated."""
-        del rig
         return sensor.is_estimated(spec)
 
     def entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
@@ -105,13 +101,11 @@ class SensorModel(Generic[S, N]):
     def scene_entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
         """Layout entries of quantities of the scene that this sensor needs, such as the reference frame of its
         poses."""
-        del sensor, rig, n_recordings
         return []
 
     def start_value(self, sensor: S, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
         """Start value (spec.size,) of a nuisance or auxiliary group (bias, scale, shape): the value of the rig file, or
         zero. None for groups that the initial guess determines."""
-        del rig
         if not (spec.manifold == "nuisance" or spec.is_auxiliary):
             return None
         stated = getattr(sensor, spec.name).value
@@ -119,18 +113,15 @@ class SensorModel(Generic[S, N]):
 
     def placing_keyframes(self, sensors: Sequence[S], rig: Rig) -> Sequence[S]:
         """Those of `sensors` that place keyframes, of a kind with `keyframes`; by default all."""
-        del rig
         return sensors
 
     def keyframe_times(self, sensor: S, stream: Any, values: dict[Key, np.ndarray], rig: Rig) -> np.ndarray:
         """(n,) times at which the sensor needs keyframes [s, body's clock since its first stamp]."""
-        del sensor, rig
         return instants(stream, values)
 
     def widen_guess_sigma(self, sensor: S, layout: Layout, state: State, sigma: np.ndarray) -> None:
         """Enlarges standard deviations (B,) of the initial guess where errors of other parameters of the sensor add to
         them, to first order at `state`."""
-        del sensor, layout, state, sigma
 
     # Noise
 
@@ -140,12 +131,10 @@ class SensorModel(Generic[S, N]):
 
     def next_noise(self, sensor: S, noise: N, statistics: ResidualStatistics) -> N:
         """Noise estimated from the residual statistics of a pass with `noise`. Stated parts are unchanged."""
-        del sensor, statistics
         return noise
 
     def noise_passes(self, sensor: S) -> int:
         """Number of passes that the noise estimate needs; 0 if all noise is stated."""
-        del sensor
         return 0
 
     def noise_is_estimated(self, sensor: S) -> bool:
@@ -156,7 +145,6 @@ class SensorModel(Generic[S, N]):
 
     def first_noises(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> dict[str, N]:
         """`first_noise` of each sensor."""
-        del measurements
         return {s.name: self.first_noise(s, rig.settings) for s in sensors}
 
     def next_noises(self, sensors: Sequence[S], noise: Mapping[str, N], end: PassEnd) -> dict[str, N]:
@@ -165,20 +153,17 @@ class SensorModel(Generic[S, N]):
 
     def passes(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> int:
         """Number of passes that the estimates of noise and inliers need."""
-        del rig, measurements
         return max((self.noise_passes(s) for s in sensors), default=0)
 
     # Factors
 
     def factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
         """Factors of the sensor in a rig with an IMU, whose motion is `at.motion`."""
-        del sensor, stream, noise, at
         return ()
 
     def still_factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
         """Factors of the sensor in a rig without an IMU. Measurements are at keyframes, and keyframes are
         independent."""
-        del sensor, stream, noise, at
         return ()
 
     def joint_factors(
@@ -186,18 +171,15 @@ class SensorModel(Generic[S, N]):
     ) -> Sequence[Factor]:
         """Factors of measurements that several sensors of the kind make together. factors: those of the single
         sensors."""
-        del sensors, factors, noise, at
         return ()
 
     def uses_more(self, used: Mapping[FactorKey, Factor], rebuilt: Callable[[], Mapping[FactorKey, Factor]]) -> bool:
         """Whether factors `rebuilt` at the end of a pass would use many more measurements than those `used` in it."""
-        del used, rebuilt
         return False
 
     def clusters(self, factors: Mapping[FactorKey, Factor]) -> Iterator[Clusters]:
         """Yields each kind of clusters of measurements whose errors may correlate, over all factors of the sensor
         kind."""
-        del factors
         yield from ()
 
     def points_on_planes(self, sensor: S, stream: Any, at: Pass) -> tuple[np.ndarray, np.ndarray] | None:
@@ -206,7 +188,6 @@ class SensorModel(Generic[S, N]):
 
         None for sensors without points.
         """
-        del sensor, stream, at
         return None
 
 

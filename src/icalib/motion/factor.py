@@ -1,4 +1,4 @@
-"""Interface of a factor: all measurements of one kind by one sensor."""
+"""Interface of a factor, and what factors share: residual rows, the chain rule by keyframes, sums of normal equations."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import Piece, in_parallel, make_pieces
 from icalib.optim.rows import LOSSES, Loss, Rows, accumulate_rows
 from icalib.optim.state import KEYFRAME_DIM, POSE_DIM, State
+
+# Interface of a factor: all measurements of one kind by one sensor.
 
 FactorKey = tuple[str, str]  # sensor, and kind of measurement
 FitKey = tuple[str, str]  # sensor, and kind of its residuals
@@ -154,32 +156,23 @@ class FactorDefaults:
 
     def with_imu(self, imu: ImuData, state: State) -> Self:
         """See `Factor`; nothing is preintegrated."""
-        del state
         factor: Any = self
         return replace(factor, imu=imu)
 
     def discarded_output(self) -> Any:
-        """See `Factor`."""
         factor: Any = self
         return factor.output()
 
     def reusable_output(self, out: Any) -> Any:
-        """See `Factor`."""
         return out
 
     def attach(self, piece: Piece, keep: bool) -> Piece:
-        """See `Factor`."""
-        del keep
         return piece
 
     def cut(self, state: State, keyframes: tuple[int, ...]) -> Self:
-        """See `Factor`."""
-        del state, keyframes
         return self
 
     def warm_started(self, out: Any) -> Self:
-        """See `Factor`."""
-        del out
         return self
 
 
@@ -242,7 +235,6 @@ class RowFactor(FactorDefaults):
 
     def raw(self, out: Whitened) -> np.ndarray | None:
         """(n, m) residuals before whitening; None if they are defined only whitened."""
-        del out
         return None
 
     def raw_sigma(self) -> np.ndarray:
@@ -250,7 +242,6 @@ class RowFactor(FactorDefaults):
         raise NotImplementedError
 
     def rows(self: _HasRows, out: Whitened, state: State) -> list[ResidualRows]:
-        """See `Factor`."""
         raw, seconds, residual_rows = self.raw(out), self.times(state) if self.kinds else np.zeros(0), []
         sigma = np.ones_like(out.residual) if raw is None else self.raw_sigma()
         for kind, c in self.kinds.items():
@@ -276,15 +267,12 @@ class RowFactor(FactorDefaults):
         return out.residual[:, self.kinds[kind]].size
 
     def squares(self: _HasRows, out: Whitened) -> dict[FitKey, Squares]:
-        """See `Factor`."""
         return {(self.name, k): Squares(self.count(out, k), chi2(out, r)) for k, r in self.kinds.items()}
 
     def sizes(self: _HasRows, out: Whitened) -> dict[FitKey, RawSize]:
-        """See `Factor`."""
         return {(self.name, kind): RawSize(*self.rms(out, kind)) for kind in self.kinds}
 
     def dof_used(self: _HasRows, out: Whitened, along: StateDifference) -> dict[FitKey, float]:
-        """See `Factor`."""
         slope = (output_at(self, along.end).residual - out.residual) / along.share * out.root
         return {(self.name, kind): float((slope[:, r] ** 2).sum()) for kind, r in self.kinds.items()}
 
@@ -352,7 +340,6 @@ class IndependentKeyframes(RowFactor):
 
     def with_imu(self, imu: ImuData, state: State) -> IndependentKeyframes:
         """The same factor, as there is no IMU."""
-        del imu, state
         return self
 
     def output(self) -> Whitened:
@@ -361,7 +348,6 @@ class IndependentKeyframes(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """Adds information that keeps the keyframes of `piece` positive definite. Returns 0, its cost."""
-        del state, out, curved
         if sums:
             information = np.concatenate([np.full(POSE_DIM, WEAK_POSE_INFORMATION), np.ones(KEYFRAME_DIM - POSE_DIM)])
             piece.diagonal[:, range(KEYFRAME_DIM), range(KEYFRAME_DIM)] += information
@@ -369,7 +355,6 @@ class IndependentKeyframes(RowFactor):
 
     def accumulate_bias_prior(self, state: State, piece: Piece, sums: bool = True) -> float:
         """Returns 0, as there are no biases."""
-        del state, piece, sums
         return 0.0
 
 

@@ -1,11 +1,4 @@
-"""Pose of the IMU at the time of a measurement: three schemes behind one function, `poses_at`.
-
-    inertial    IMU readings integrated from the nearest keyframe to t, forwards or backwards
-    kinematic   constant angular rate and velocity from the nearest keyframe, iCalib paper (8)-(9)
-    pose        between the two neighbouring keyframes, iCalib paper (10)-(12); position interpolated linearly
-
-A measurement stays assigned to its keyframe while the solver runs; only its time moves with the time offset.
-"""
+"""The estimated motion at the time of a measurement: poses, sweeps of a LiDAR, time offsets, keyframes."""
 
 from __future__ import annotations
 
@@ -48,6 +41,14 @@ from icalib.motion.integration_step import (
 from icalib.optim.state import KEYFRAME_DIM, Key, Layout, State
 from icalib.rig import Scheme
 from icalib.rig.scene import GRAVITY, WORLD
+
+# Pose of the IMU at the time of a measurement: three schemes behind one function, `poses_at`.
+#
+#     inertial    IMU readings integrated from the nearest keyframe to t, forwards or backwards
+#     kinematic   constant angular rate and velocity from the nearest keyframe, iCalib paper (8)-(9)
+#     pose        between the two neighbouring keyframes, iCalib paper (10)-(12); position interpolated linearly
+#
+# A measurement stays assigned to its keyframe while the solver runs; only its time moves with the time offset.
 
 
 @dataclass(frozen=True)

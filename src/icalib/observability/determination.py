@@ -1,15 +1,4 @@
-"""The null space of the data, and estimates in which it is fixed at the initial guess.
-
-Broad priors do not make an unobservable direction harmless. The solver drifts along it, and parameters that couple with
-it at second order become wrong, with a small standard deviation. The null space is therefore that of the information of
-the data alone, without the information that noise in the Jacobian adds. Its directions are reset to the guess and fixed
-there, and everything else is estimated again until the null space no longer changes. The sensitivity of the other
-parameters to the guess along these directions is part of the covariance (consider covariance).
-
-Noise in the Jacobian can constrain an unobservable direction as strongly as data would, and can hide weak data. The
-solver does not drift along such a direction, and a reset to the guess would increase chi^2. The direction is fixed at
-its estimate, unless this is farther from the guess than the prior uncertainty of the guess allows.
-"""
+"""The null space of the data, estimates in which it is fixed at the initial guess, contradictions, and sentences."""
 
 from __future__ import annotations
 
@@ -50,6 +39,19 @@ from icalib.optim.state import Block, Key, State
 from icalib.result import Verdict
 from icalib.result.verdict import by_size, in_null_space
 from icalib.rig import Parameter, ParameterSpec
+
+# The null space of the data, and estimates in which it is fixed at the initial guess.
+#
+# Broad priors do not make an unobservable direction harmless. The solver drifts along it, and parameters that couple
+# with it at second order become wrong, with a small standard deviation. The null space is therefore that of the
+# information of the data alone, without the information that noise in the Jacobian adds. Its directions are reset to
+# the guess and fixed there, and everything else is estimated again until the null space no longer changes. The
+# sensitivity of the other parameters to the guess along these directions is part of the covariance (consider
+# covariance).
+#
+# Noise in the Jacobian can constrain an unobservable direction as strongly as data would, and can hide weak data. The
+# solver does not drift along such a direction, and a reset to the guess would increase chi^2. The direction is fixed
+# at its estimate, unless this is farther from the guess than the prior uncertainty of the guess allows.
 
 # A direction may be unobservable only if less than this share of its information is left without noise in the Jacobian.
 SPURIOUS_SHARE = 0.5

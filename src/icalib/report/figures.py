@@ -1,4 +1,4 @@
-"""Figures as plain data that plotly.js draws. Plotly's Python package is slow to import and not needed."""
+"""Figures of the report: axes, colours, panels, histograms, curves of residuals."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 from icalib.kinds import presenters
 from icalib.result import Calibration, RowResiduals
 from icalib.sensors.stream import Residuals
+
+# Figures as plain data that plotly.js draws. Plotly's Python package is slow to import and not needed.
 
 Figure = dict[str, Any]
 COLORS = ("#2563a8", "#d97706", "#15803d", "#7c3aed", "#be185d", "#0e7490")

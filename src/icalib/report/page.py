@@ -1,5 +1,4 @@
-"""`report.html`: one HTML file that needs no network. The verdict comes first, the supporting figures and tables after
-it."""
+"""The report as one HTML file, and the sections, cards and tables of which it is made."""
 
 from __future__ import annotations
 
@@ -70,6 +69,9 @@ from icalib.result.verdict import (
     worst,
 )
 from icalib.sensors.stream import Residuals
+
+# `report.html`: one HTML file that needs no network. The verdict comes first, the supporting figures and tables after
+# it.
 
 _NO_CROSS_VALIDATION = (
     "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "

@@ -1,4 +1,4 @@
-"""Figures of the rig in 3D, and of the correlation of its parameters."""
+"""Pictures of the rig, of its uncertainty and of its motion."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from icalib.report.figures import (
 )
 from icalib.result import Calibration, joint_covariance
 from icalib.result.verdict import worst
+
+# Figures of the rig in 3D, and of the correlation of its parameters.
 
 
 def rig_picture(c: Calibration) -> Figure:

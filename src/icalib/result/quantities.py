@@ -1,4 +1,4 @@
-"""Parameters as text in degrees, millimetres and milliseconds, rounded according to the standard deviation."""
+"""Parameters as text, rounded by their standard deviation; poses relative to the body; sizes of residuals."""
 
 from __future__ import annotations
 
@@ -27,6 +27,8 @@ from icalib.rig import LENS
 from icalib.rig.rig import ONE
 from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import ROTATION, TRANSLATION
+
+# Parameters as text in degrees, millimetres and milliseconds, rounded according to the standard deviation.
 
 TURNS = ("roll", "pitch", "yaw")
 NOT_COUNTED = "In brackets: without weight in the verdict, as auxiliary, with a prior, or of a lens that projects well."

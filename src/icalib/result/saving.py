@@ -1,4 +1,4 @@
-"""Writes a `Calibration` to files and reads it back without loss of precision. File formats: docs/files.md."""
+"""Writes a `Calibration` to files and reads it back without loss of precision; summary and rig file from a result."""
 
 from __future__ import annotations
 
@@ -43,6 +43,8 @@ from icalib.sensors.lidar.stream import LidarResiduals
 from icalib.sensors.parameter import Parameter
 from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 from icalib.sensors.stream import Residuals, RowResiduals
+
+# Writes a `Calibration` to files and reads it back without loss of precision. File formats: docs/files.md.
 
 FORMAT, FORMAT_VERSION = "icalib result", 4
 RECORDS = (ImuResiduals, CornerResiduals, TrackResiduals, LidarResiduals)  # others are `RowResiduals`

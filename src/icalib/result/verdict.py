@@ -1,17 +1,4 @@
-"""Verdict on a result: whether it can be used, and why not. No other module decides this.
-
-Console, report, calibration.yaml, result.json and the exit code of `--strict` show this verdict. It is the worst that
-applies of:
-
-    not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
-    partly usable     components are unobservable or too uncertain; all others can be used
-    usable with care  there is a warning, or a component whose standard deviation exceeds its tolerance
-    usable            none of these
-
-A lens is judged by its projection uncertainty over the image regions with observations, not by single coefficients,
-which are strongly correlated. A component with a prior does not count: it is at least as good as its prior. Nuisance
-parameters (edge bloom, board shape and tilt) do not count.
-"""
+"""Verdict on a result and its reasons; projection uncertainty and relative poses with their covariance."""
 
 from __future__ import annotations
 
@@ -32,6 +19,20 @@ from icalib.sensors.parameter import display_unit
 if TYPE_CHECKING:
     from icalib.result.calibration import Calibration, ParameterGroup, Verdict
 
+
+# Verdict on a result: whether it can be used, and why not. No other module decides this.
+#
+# Console, report, calibration.yaml, result.json and the exit code of `--strict` show this verdict. It is the worst
+# that applies of:
+#
+#     not usable        the solver did not converge, or a check says that the rig file or the recording is wrong
+#     partly usable     components are unobservable or too uncertain; all others can be used
+#     usable with care  there is a warning, or a component whose standard deviation exceeds its tolerance
+#     usable            none of these
+#
+# A lens is judged by its projection uncertainty over the image regions with observations, not by single coefficients,
+# which are strongly correlated. A component with a prior does not count: it is at least as good as its prior. Nuisance
+# parameters (edge bloom, board shape and tilt) do not count.
 
 Usability = Literal["usable", "usable with care", "partly usable", "not usable"]
 

@@ -122,7 +122,6 @@ class Stream:
     def relative_to(self, origin: np.ndarray) -> Self:
         """The stream with positions relative to `origin` (3,) [m] of its frame. Streams without positions are
         unchanged."""
-        del origin
         return self
 
     @classmethod

@@ -1,9 +1,4 @@
-"""Possible causes of large residuals, ranked by the part of the misfit that they explain.
-
-A cause is tested by its gain: the decrease of chi^2 if the cause is modelled. A significant cause that explains hardly
-any of the misfit is not named. If no cause explains the misfit, the message says so and lists the checks. Another noise
-density of the IMU is advised only if its readings show it by themselves.
-"""
+"""Possible causes of a wrong result, ranked by the part of the misfit that they explain."""
 
 from __future__ import annotations
 
@@ -35,6 +30,12 @@ from icalib.validation.guesses import (
     size_words,
     stated_words,
 )
+
+# Possible causes of large residuals, ranked by the part of the misfit that they explain.
+#
+# A cause is tested by its gain: the decrease of chi^2 if the cause is modelled. A significant cause that explains
+# hardly any of the misfit is not named. If no cause explains the misfit, the message says so and lists the checks.
+# Another noise density of the IMU is advised only if its readings show it by themselves.
 
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
 # than 0.01.

@@ -1,4 +1,4 @@
-"""Notes on initial guesses of the rig file that the data contradict, with likely mistakes."""
+"""Initial guesses and stated values that the data contradict, likely mistakes behind them, and sources of the scale."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import TRANSLATION
+
+# Notes on initial guesses of the rig file that the data contradict, with likely mistakes.
 
 
 def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:

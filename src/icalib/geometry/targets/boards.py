@@ -1,4 +1,4 @@
-"""Kalibr's AprilGrid."""
+"""Boards and tags as targets: their points, and how they are told apart and drawn."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets.base import UNIT_TAG, TagTarget, Target, UntaggedTarget
 from icalib.geometry.targets.families import APRILGRID_FAMILY, FAMILIES, TagSet, checked_family, opencv_bits, tag_bits
+
+# Kalibr's AprilGrid.
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,6 @@ class NoTarget(Target):
         return ()
 
     def point_index(self, tag_id: np.ndarray, corner: np.ndarray) -> np.ndarray:
-        del tag_id, corner
         raise RecordingError("the rig file has no target; add one.")
 
     def point_identity(self, index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

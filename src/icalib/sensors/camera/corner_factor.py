@@ -123,7 +123,6 @@ class CornerFactor(FactorDefaults):
         return len(self.stream.uv) > 0
 
     def with_target_size(self, size: float) -> CornerFactor:
-        """See `TargetFactor`."""
         return replace(self, bodies=replace(self.bodies, size=size))
 
     @cached_property
@@ -240,7 +239,6 @@ class CornerFactor(FactorDefaults):
         return [rows] if len(seconds) else []
 
     def dof_used(self, out: CornerOutput, along: StateDifference) -> dict[FitKey, float]:
-        """See `Factor`."""
         return dof_used_by_corners(self, out, along)
 
     def with_direction(self, direction: np.ndarray) -> CornerFactor:

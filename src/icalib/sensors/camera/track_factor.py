@@ -194,12 +194,10 @@ class FeatureFactor(FactorDefaults):
         )  # fmt: skip
 
     def with_imu(self, imu: ImuData, state: State) -> FeatureFactor:
-        """See `Factor`."""
         return replace(self, cameras=tuple(c.with_imu(imu, state) for c in self.cameras))
 
     def reusable_output(self, out: FeatureOutput) -> FeatureOutput:
         """See `Factor`: new arrays, because a cut changes the tracks."""
-        del out
         return self.output()
 
     def warm_started(self, out: FeatureOutput) -> FeatureFactor:
@@ -211,7 +209,6 @@ class FeatureFactor(FactorDefaults):
         return feature_squares(self, out)
 
     def sizes(self, out: FeatureOutput) -> dict[FitKey, RawSize]:
-        """See `Factor`."""
         return feature_sizes(self, out)
 
     def rows(self, out: FeatureOutput, state: State) -> list[ResidualRows]:
@@ -219,7 +216,6 @@ class FeatureFactor(FactorDefaults):
         return feature_rows(self, out, state)
 
     def dof_used(self, out: FeatureOutput, along: StateDifference) -> dict[FitKey, float]:
-        """See `Factor`."""
         return dof_used_by_features(self, out, along)
 
     def attach(self, piece: Piece, keep: bool) -> Piece:

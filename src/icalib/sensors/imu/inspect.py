@@ -99,7 +99,6 @@ class ImuSource(SensorSource):
 
     @property
     def read_topic(self) -> TopicInfo:
-        """See `SensorSource`."""
         return self.topic
 
 
@@ -211,7 +210,6 @@ class ImuInspector(KindInspector):
     checks: ClassVar = {"use": refused, "quality": of_readings, "gaps": gaps}
 
     def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, ImuSource]]:
-        """See `KindInspector`."""
         return ((topic_key(t), ImuSource(self.sensor.sensor_type, t)) for t in topics if t.kind in self.topic_kinds)
 
     def joined(self, recording: Recording, sources: Sources) -> Sources:
@@ -243,7 +241,6 @@ class ImuInspector(KindInspector):
         return imu_lines(inspection, inspection.sources.of(self.sensor.sensor_type))
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
-        """See `KindInspector`."""
         return {"topic": inspection.sources.sensors[name].topic.name} | plain(inspection.facts[name])
 
     def readings_tables(self, inspection: Inspection) -> Iterator[Table]:

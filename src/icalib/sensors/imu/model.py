@@ -18,12 +18,10 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
 
     def first_noise(self, sensor: ImuSensor, settings: Settings) -> ImuNoise:
         """See `SensorModel`; the noise in the rig file."""
-        del settings
         return sensor.noise
 
     def factors(self, sensor: ImuSensor, stream: ImuStream, noise: ImuNoise, at: Pass) -> Iterator[ImuFactor]:
         """Yields the factor of all intervals between keyframes. The readings of `at` already contain the noise."""
-        del stream, noise
         assert at.motion is not None
         intrinsics, key = at.layout.columns(sensor.name, "intrinsics"), (WORLD, GRAVITY.name)
         gravity = at.layout.columns(*key) if at.layout.has(*key) else intrinsics[:0]

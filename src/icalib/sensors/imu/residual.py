@@ -217,7 +217,6 @@ class ImuFactor(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """See `RowFactor`."""
         return KINDS
 
     @property
@@ -275,12 +274,10 @@ class ImuFactor(RowFactor):
         return cls(imu, gravity, columns, gravity_column, Increments(*arrays, bias0), intrinsics, state.starts)
 
     def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
-        """See `Factor`."""
         return ImuFactor.build(imu, state, self.gravity, self.columns, self.gravity_column)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
-        del curved
         dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0
         dx = dx if self.increments.J.shape[2] > 6 else np.zeros(0)
         gravity = gravity_of(state, self.gravity)

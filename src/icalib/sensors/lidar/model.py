@@ -26,12 +26,9 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     keyframes = "scans"
 
     def takes_part(self, sensor: Lidar, association: PlaneAssociation) -> bool:
-        """See `SensorModel`."""
-        del sensor
         return association.count > 0
 
     def first_noise(self, sensor: Lidar, settings: Settings) -> LidarNoise:
-        """See `SensorModel`."""
         loss, scale = settings.loss, settings.loss_scale
         if sensor.range_noise_m is None:
             return LidarNoise(FIRST_RANGE_SIGMA_M, 0.0, loss, scale)
@@ -46,7 +43,6 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         return LidarNoise(sigma, 0.0, noise.loss, noise.loss_scale)
 
     def noise_passes(self, sensor: Lidar) -> int:
-        """See `SensorModel`."""
         return int(sensor.range_noise_m is None)
 
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:

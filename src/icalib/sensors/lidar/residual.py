@@ -102,12 +102,10 @@ class LidarFactor(RowFactor):
 
     @property
     def key(self) -> FactorKey:
-        """See `Factor`."""
         return self.name, "points"
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """See `RowFactor`."""
         return {"points": slice(0, N_WHITENED)}
 
     def output(self) -> Whitened:
@@ -116,7 +114,6 @@ class LidarFactor(RowFactor):
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`. `curved` has no effect: weights are constant within a pass."""
-        del curved
         into, total = piece.sums(sums), 0.0
         for bins, at, columns, planes in self._chunks(state, *self._bins_of(piece)):
             total += kernels.accumulate(bins, at, columns, planes, into, out.residual)
@@ -124,7 +121,6 @@ class LidarFactor(RowFactor):
 
     def count(self, out: Whitened, kind: str) -> int:
         """Number of points, as the chi^2 of the rows equals that of all points."""
-        del out, kind
         return int(self.moments.count.sum())
 
     def times(self, state: State) -> np.ndarray:
@@ -134,7 +130,6 @@ class LidarFactor(RowFactor):
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:
         """Weighted RMS of the distances of points from their planes, and its unit."""
-        del kind
         weight = float((self.moments.root[:, 0] ** 2).sum())
         return float(np.sqrt((out.residual**2).sum() / weight)), "m"
 

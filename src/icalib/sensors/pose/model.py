@@ -37,31 +37,26 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
 
     def placing_keyframes(self, sensors: Sequence[PoseSensor], rig: Rig) -> Sequence[PoseSensor]:
         """Only the first sensor, see `SensorModel`."""
-        del rig
         return sensors[:1]
 
     def keyframe_times(
         self, sensor: PoseSensor, stream: PoseStream, values: dict[Key, np.ndarray], rig: Rig
     ) -> np.ndarray:
         """Times of poses at about the keyframe spacing, in seconds on the IMU's clock."""
-        del sensor
         imu = rig.imu or ImuSensor  # the default spacing without an IMU
         return instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))
 
     def first_noise(self, sensor: PoseSensor, settings: Settings) -> PoseNoise:
-        """See `SensorModel`."""
         rotation = FIRST_ROTATION_NOISE if sensor.rotation_noise is None else sensor.rotation_noise
         position = FIRST_POSITION_NOISE if sensor.position_noise is None else sensor.position_noise
         return PoseNoise(rotation, position, settings.loss, settings.loss_scale)
 
     def next_noise(self, sensor: PoseSensor, noise: PoseNoise, statistics: ResidualStatistics) -> PoseNoise:
-        """See `SensorModel`."""
         if not self.noise_is_estimated(sensor):
             return noise
         return estimated_noise(sensor, noise, statistics.variance_factors())
 
     def noise_passes(self, sensor: PoseSensor) -> int:
-        """See `SensorModel`."""
         return 2 if sensor.rotation_noise is None or sensor.position_noise is None else 0
 
     def factors(self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass) -> Iterator[PoseFactor]:

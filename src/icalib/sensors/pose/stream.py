@@ -32,9 +32,7 @@ class PoseStream(Stream):
         check(shape == (n, 3), f"{self.name}: position must have shape ({n}, 3), not {shape}.")
 
     def better_origin(self) -> np.ndarray | None:
-        """See `Stream`."""
         return far_origin(self.position)
 
     def relative_to(self, origin: np.ndarray) -> PoseStream:
-        """See `Stream`."""
         return replace(self, position=self.position - origin)

@@ -38,7 +38,6 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
     """Sentences on the number of fixes in use, their noise, and time offsets that are differences of time scales."""
-    del timeline
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
         sensor, stream = inputs.sensor(factor.name), inputs.stream(factor.name)
         assert isinstance(stream, PositionStream)
@@ -100,7 +99,6 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
 
 def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
     """A sentence if the residuals are larger than the stated noise predicts, else None."""
-    del is_noise
     if excess(f) == 1.0:
         return None
     if f.kind == SLOW_OFFSET:
@@ -114,7 +112,6 @@ def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
 
 def length(sensor: PositionSensor, rig: Rig) -> str | None:
     """The measurements of this sensor that make the metric scale observable, as words of a sentence."""
-    del rig
     return f"the positions of {sensor.name}"
 
 

@@ -48,7 +48,6 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         return PositionNoise(first, first, settings.loss, settings.loss_scale)
 
     def next_noise(self, sensor: PositionSensor, noise: PositionNoise, statistics: ResidualStatistics) -> PositionNoise:
-        """See `SensorModel`."""
         if not self.noise_is_estimated(sensor):
             return noise
         factors = statistics.variance_factors()
@@ -59,7 +58,6 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         return replace(noise, horizontal=horizontal, vertical=vertical)
 
     def noise_passes(self, sensor: PositionSensor) -> int:
-        """See `SensorModel`."""
         return 2 if sensor.position_noise is None else 0
 
     def factors(

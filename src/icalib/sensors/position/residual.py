@@ -1,12 +1,4 @@
-"""The factor of a position sensor: difference between the trajectory of the IMU and each fix.
-
-    e = R_world_frame^T (p_world_imu + R_world_imu p_imu_sensor - p_world_frame) - p_frame_sensor
-
-at the instant of the fix on the IMU's clock. The IMU's readings propagate the trajectory to that instant; fixes are
-never interpolated. Parameters: translation (p_imu_sensor) and time_offset of the sensor, and those of its frame in each
-recording. These are frame_yaw or frame_rotation with frame_translation, or the tilt of the target: see `frame`. A slow
-offset of the fixes adds to e: see `walk_factor`.
-"""
+"""The factor of a position sensor, the random walk of its errors, and how large they are."""
 
 from __future__ import annotations
 
@@ -42,6 +34,15 @@ from icalib.rig.scene import FRAME_OFFSET
 from icalib.sensors.position.frame import PositionFrame
 from icalib.sensors.position.read import MAX_GAP_STEPS, MIN_OUTLIER_M, MIN_STEP_M
 from icalib.sensors.position.stream import PositionStream
+
+# The factor of a position sensor: difference between the trajectory of the IMU and each fix.
+#
+#     e = R_world_frame^T (p_world_imu + R_world_imu p_imu_sensor - p_world_frame) - p_frame_sensor
+#
+# at the instant of the fix on the IMU's clock. The IMU's readings propagate the trajectory to that instant; fixes are
+# never interpolated. Parameters: translation (p_imu_sensor) and time_offset of the sensor, and those of its frame in
+# each recording. These are frame_yaw or frame_rotation with frame_translation, or the tilt of the target: see `frame`.
+# A slow offset of the fixes adds to e: see `walk_factor`.
 
 # Fixes further from every keyframe are left out, because residuals neglect the propagated IMU noise. A poor
 # accelerometer, of 0.01 m/s^2/sqrt(Hz), adds 1 mm to a position over this time.
@@ -125,7 +126,6 @@ class PositionFactor(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """See `Factor`."""
         return KINDS
 
     def output(self) -> Whitened:
@@ -133,7 +133,6 @@ class PositionFactor(RowFactor):
         return Whitened.empty(len(self.seconds), 3)
 
     def times(self, state: State) -> np.ndarray:
-        """See `RowFactor`."""
         return self.seconds + offset_at(state, self.name, self.keyframe)
 
     def raw(self, out: Whitened) -> np.ndarray:
@@ -156,7 +155,6 @@ class PositionFactor(RowFactor):
         }
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `Factor`."""
         into, parts = (
             Into(piece, out, sums, curved),
             rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece),
@@ -343,12 +341,10 @@ class OffsetWalkFactor(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """See `Factor`."""
         return {SLOW_OFFSET: slice(0, 3)}
 
     def with_imu(self, imu: ImuData, state: State) -> OffsetWalkFactor:
         """This factor unchanged: it does not depend on the motion."""
-        del imu, state
         return self
 
     def output(self) -> Whitened:
@@ -356,7 +352,6 @@ class OffsetWalkFactor(RowFactor):
         return Whitened.empty(len(self.seconds), 3)
 
     def times(self, state: State) -> np.ndarray:
-        """See `RowFactor`."""
         offset = state.values[self.name, "time_offset"]
         recording = np.array([s.recording for s in self.walk.segments])
         return self.seconds + offset[recording if len(offset) > 1 else 0]
@@ -375,7 +370,6 @@ class OffsetWalkFactor(RowFactor):
         return np.tile(self.sigma[:, None], (1, 3))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `Factor`."""
         into, knots = Into(piece, out, sums, curved), self.walk.knots(state)
         increments, whitening = knots[:, 1] - knots[:, 0], np.eye(3) / self.sigma[:, None, None]
         J = np.zeros((1 if sums else 0, 3, KEYFRAME_PAIR_DIM + 6))

@@ -69,12 +69,10 @@ class PositionSensor(ClockedSensor):
 
     @property
     def has_frame(self) -> bool:
-        """See `Sensor`."""
         return self.frame in (LEVELLED, TILTED)
 
     @property
     def shared_frame(self) -> str:
-        """See `Sensor`."""
         return "" if self.has_frame else self.frame
 
     def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:

@@ -35,7 +35,6 @@ class PositionStream(Stream):
         return replace(self, stamps_ns=self.stamps_ns[kept], position=self.position[kept], covariance=covariance)
 
     def relative_to(self, origin: np.ndarray) -> PositionStream:
-        """See `Stream`."""
         return replace(self, position=self.position - origin)
 
     @property

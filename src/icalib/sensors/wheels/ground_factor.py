@@ -99,7 +99,6 @@ class GroundFactor(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """See `Factor`."""
         tilt = {TILT: slice(0, 2)} if self.ground.tilt_noise is not None else {}
         return tilt | ({HEIGHT: slice(2, 3)} if self.ground.height_sigma is not None else {})
 
@@ -113,15 +112,12 @@ class GroundFactor(RowFactor):
 
     def with_imu(self, imu: ImuData, state: State) -> GroundFactor:
         """See `Factor`; rows at keyframes do not depend on IMU readings."""
-        del imu, state
         return self
 
     def output(self) -> Whitened:
-        """See `Factor`."""
         return Whitened.empty(len(self.keyframes), 4)
 
     def times(self, state: State) -> np.ndarray:
-        """See `RowFactor`."""
         return state.seconds[self.keyframes]
 
     def raw(self, out: Whitened) -> np.ndarray:
@@ -133,7 +129,6 @@ class GroundFactor(RowFactor):
         return np.tile(self.sigma, (len(self.keyframes), 1))
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
-        """See `Factor`."""
         cost = 0.0
         ends = (*self.starts[1:], len(state.seconds))
         for begin, end, key in zip(self.starts, ends, self.floor, strict=True):

@@ -1,14 +1,4 @@
-"""Compiled kernels of the increment factor: residuals and Jacobians of the motion between two instants.
-
-An increment is compared with a displacement X [m] and a rotation vector T [rad] in wheel axes. Both follow from the
-motion of the IMU over the interval from s_0 to s_1. With D the integral of R_world_imu^T v over the interval and
-Y = D + Theta x p_imu_wheel:
-
-    X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R_world_imu(s_0)^T R_world_imu(s_1))
-
-A row of the model (`drive_rows`) is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians J (6, ...) of
-(D, Theta): rows 0 to 2 for D, rows 3 to 5 for Theta. J_calib (6, 1 + 24 or 0): by time offset and IMU intrinsics.
-"""
+"""Kernels of the increments of wheels, and rows by drive parameters."""
 
 from __future__ import annotations
 
@@ -23,6 +13,17 @@ from icalib.motion.sensor_pose import N_POSE_PARAMETERS, OFFSET_COLUMN
 from icalib.optim.rows import KEYFRAME_PAIR_DIM
 from icalib.optim.state import KEYFRAME_DIM
 from icalib.rig import WheelKind
+
+# Compiled kernels of the increment factor: residuals and Jacobians of the motion between two instants.
+#
+# An increment is compared with a displacement X [m] and a rotation vector T [rad] in wheel axes. Both follow from the
+# motion of the IMU over the interval from s_0 to s_1. With D the integral of R_world_imu^T v over the interval and Y =
+# D + Theta x p_imu_wheel:
+#
+#     X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R_world_imu(s_0)^T R_world_imu(s_1))
+#
+# A row of the model (`drive_rows`) is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians J (6, ...) of
+# (D, Theta): rows 0 to 2 for D, rows 3 to 5 for Theta. J_calib (6, 1 + 24 or 0): by time offset and IMU intrinsics.
 
 
 class WheelParameters(NamedTuple):
@@ -235,7 +236,6 @@ def coefficients(kind: WheelKind, drive: np.ndarray, mean: np.ndarray) -> Coeffi
 
 def _pair(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
     """Fills the first two rows of a pair."""
-    del mean
     b = drive[2]
     for q, side in enumerate((LEFT, RIGHT)):
         r = drive[q]
@@ -246,7 +246,6 @@ def _pair(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
 
 def _twist(c: Coefficients, drive: np.ndarray, mean: np.ndarray) -> None:
     """Fills the first two rows of a twist."""
-    del mean
     speed, yaw = drive[:2]
     c.g_X[:, 0, 0], c.g_T[:, 1, 2] = 1.0 / speed, 1.0 / yaw
     c.J_g_X[:, 0, 0, 0], c.J_g_T[:, 1, 1, 2] = -1.0 / speed**2, -1.0 / yaw**2

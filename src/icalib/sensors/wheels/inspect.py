@@ -34,7 +34,6 @@ class WheelInspector(KindInspector):
         )
 
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
-        """See `KindInspector`."""
         if topic.kind in ("twist", "odometry") or "twist" in topic.type:
             yield "measures: twist"
         if moves_on_floor(inspection):

@@ -29,12 +29,10 @@ class WheelModel(SensorModel[Wheels, WheelNoise]):
         self, sensor: Wheels, stream: WheelStream | WheelPoses, values: dict[Key, np.ndarray], rig: Rig
     ) -> np.ndarray:
         """Times of readings at about the keyframe spacing, see `SensorModel`."""
-        del sensor
         assert rig.imu is not None
         return instants(stream, values, spaced(stream.seconds, rig.imu.pose_keyframes_s))
 
     def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
-        """See `SensorModel`."""
         return WheelNoise(
             sensor.wheel_noise, sensor.lateral_slip, sensor.vertical_slip, settings.loss, settings.loss_scale,
             sensor.speed_noise, sensor.yaw_noise, sensor.steering_noise,

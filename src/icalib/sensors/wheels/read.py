@@ -224,7 +224,6 @@ MESSAGES = (
 
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
-    del layout
     kind = RELATIVE_POSES if holds(path, RELATIVE_POSES) else STAMPS
     return read_table(path, kind).integers[:, 0].copy()
 

@@ -219,7 +219,6 @@ class Wheels(MountedSensor):
 
     @property
     def stays_level(self) -> bool:
-        """See `Sensor`."""
         return self.ground is not None and self.ground.plane == "level" and self.ground.tilt_noise is not None
 
     @classmethod

@@ -59,7 +59,6 @@ class WheelPoses(Stream):
     @classmethod
     def joined(cls, streams: Sequence[Any], shifts_ns: Sequence[int] | None = None) -> Self:
         """Always raises RecordingError: there is no relative pose between two recordings."""
-        del shifts_ns
         raise RecordingError(
             f"{streams[0].name} measures relative poses, and there is none between two recordings; give one "
             "recording, or wheels that measure rates, angles or ticks."

@@ -1,4 +1,4 @@
-"""Result of a fleet: the results of all jobs, and the changes of each robot."""
+"""Jobs of a fleet, their results and records on disk, and the changes of each robot."""
 
 from __future__ import annotations
 
@@ -25,6 +25,8 @@ from icalib.result import Calibration, ParameterGroup, joint_covariance, load_ca
 from icalib.result.quantities import nontrivial_groups
 from icalib.tools.batch import check_worker, plain_record, program, record_json, sentence_on
 from icalib.tools.comparison.compare import Comparison, Difference, Side, compare_sides, sentence, side_of_result
+
+# Result of a fleet: the results of all jobs, and the changes of each robot.
 
 
 @dataclass(frozen=True)

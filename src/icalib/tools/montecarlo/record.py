@@ -1,4 +1,4 @@
-"""Record of one run: its errors and their covariance, and the JSON format that preserves every bit of them."""
+"""One run of a study, its record, and the store of all records."""
 
 from __future__ import annotations
 
@@ -20,6 +20,8 @@ from icalib.result.calibration import versions
 from icalib.sensors.stream import Successive
 from icalib.tools.batch import check_worker, plain_record, program, record_json, sentence_on, write_atomically
 from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess
+
+# Record of one run: its errors and their covariance, and the JSON format that preserves every bit of them.
 
 FORMAT = 2
 LEAST_SIGMA = 1e-100  # replaces a standard deviation of 0, so that an error over it is finite

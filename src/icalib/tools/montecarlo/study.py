@@ -1,7 +1,4 @@
-"""A Monte-Carlo study: runs of one scenario with different seeds, and their summary. A rerun resumes it.
-
-Runs of a study on many cores or machines.
-"""
+"""Many simulated runs of one scenario, and their text on the console."""
 
 from __future__ import annotations
 
@@ -37,6 +34,10 @@ from icalib.tools.montecarlo.summary import (
     unobservable_words,
 )
 from icalib.tools.simulation import Drive, Scenario, load_scenario
+
+# A Monte-Carlo study: runs of one scenario with different seeds, and their summary. A rerun resumes it.
+#
+# Runs of a study on many cores or machines.
 
 Progress = Callable[[str, float], None]
 FILES = ("consistency.json", "consistency.html")

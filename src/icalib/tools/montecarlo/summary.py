@@ -1,12 +1,4 @@
-"""Consistency of errors and covariances over many runs: NEES, and sampled against predicted covariance.
-
-Summary of the runs of a study, computed from their records.
-
-Statistics exclude entries that are unusable in a run, which means unobservable or too uncertain: their formal standard
-deviation is that of a guess, or of a problem linearised too far from the truth.
-
-Figures of a study as text, in degrees, millimetres and milliseconds.
-"""
+"""Consistency of errors and covariances over many runs, and the page that shows it."""
 
 from __future__ import annotations
 
@@ -25,6 +17,15 @@ from icalib.result.quantities import format_number
 from icalib.result.verdict import UNUSABLE
 from icalib.sensors.parameter import display_unit
 from icalib.tools.montecarlo.record import GroupErrors, Identity, RunRecord
+
+# Consistency of errors and covariances over many runs: NEES, and sampled against predicted covariance.
+#
+# Summary of the runs of a study, computed from their records.
+#
+# Statistics exclude entries that are unusable in a run, which means unobservable or too uncertain: their formal
+# standard deviation is that of a guess, or of a problem linearised too far from the truth.
+#
+# Figures of a study as text, in degrees, millimetres and milliseconds.
 
 PROBABILITY = 0.95  # that a consistent covariance has its statistic within the bounds
 LEAST_VARIANCE = 1e-13  # smallest eigenvalue of a correlation matrix: below it is rounding

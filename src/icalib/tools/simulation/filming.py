@@ -1,9 +1,4 @@
-"""Simulates recordings with rendered images instead of corners; stamps and motion are those of `simulate`.
-
-Images are rendered by threads on demand, a few ahead, so that a recording is never in memory as a whole.
-
-People in front of a camera: upright boxes that follow it with a delay, and sway from side to side.
-"""
+"""Simulates recordings with rendered images instead of corners, and the interior of rooms that they show."""
 
 from __future__ import annotations
 
@@ -60,6 +55,12 @@ from icalib.tools.simulation.trajectory import TrueTrajectory
 #
 # Each pixel is divided into 2 x 2 cells. A cell has a ray through the lens, an instant within the exposure, and the
 # mean brightness of its footprint on the surface that the ray meets.
+
+# Simulates recordings with rendered images instead of corners; stamps and motion are those of `simulate`.
+#
+# Images are rendered by threads on demand, a few ahead, so that a recording is never in memory as a whole.
+#
+# People in front of a camera: upright boxes that follow it with a delay, and sway from side to side.
 
 CELLS = 2  # per pixel, along each axis
 TILE = 16  # pixels along each axis

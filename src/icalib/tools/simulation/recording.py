@@ -1,4 +1,4 @@
-"""Simulates the measurements of a scenario, and their truth."""
+"""Simulates all sensors of a scenario."""
 
 from __future__ import annotations
 
@@ -38,6 +38,8 @@ from icalib.tools.simulation.scenario import (
     SimSensor,
 )
 from icalib.tools.simulation.trajectory import Drive, TrueTrajectory
+
+# Simulates the measurements of a scenario, and their truth.
 
 Progress = Callable[[str, float], None]  # called with the current step, and the progress of the whole, 0 to 1
 _CAMERA_STREAM = 2  # number of the first camera's random stream; further cameras have the following ones

@@ -1,4 +1,4 @@
-"""Description of a simulation: the rig, its motion, the room and the noise."""
+"""Description of a simulation: the rig, its motion, the room, the noise, and effects beyond the model."""
 
 from __future__ import annotations
 
@@ -26,6 +26,8 @@ from icalib.tools.simulation.trajectory import Drive, Features, TrueTrajectory
 # Base class of simulated sensors other than IMU and cameras.
 #
 # The class of a kind is `icalib.sensors.KIND.simulate.SIMULATED`.
+
+# Description of a simulation: the rig, its motion, the room and the noise.
 
 BagEvent = tuple[int, Callable[[BagWriter], Any]]  # instant of reception on the IMU's clock [ns]; maker of the message
 

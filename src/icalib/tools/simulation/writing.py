@@ -1,4 +1,4 @@
-"""Writes films as bags of ROS 1 and ROS 2 by rosbags (extra `bags`), or in EuRoC's layout (extra `images`)."""
+"""Writes simulated recordings as tables and bags."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from icalib.tools.simulation.recording import Simulation, Truth
 from icalib.tools.simulation.rendering import Imaging
 from icalib.tools.simulation.rigs import rig_text
 from icalib.tools.simulation.scenario import BagTopic, Scenario
+
+# Writes films as bags of ROS 1 and ROS 2 by rosbags (extra `bags`), or in EuRoC's layout (extra `images`).
 
 Form = BagForm | Literal["euroc"]
 FORMS: tuple[Form, ...] = ("ros1", "mcap", "sqlite3", "euroc")

@@ -104,7 +104,6 @@ class CameraInitializer(Initializer[Camera]):
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Camera]) -> Values:
         """Values of cameras with feature tracks, aligned to the trajectory in `state`."""
-        del sensors
         return track_camera_values(inputs, state)
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
@@ -124,7 +123,6 @@ class CameraInitializer(Initializer[Camera]):
         self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
     ) -> EstimationError | None:
         """See `Initializer`: the error that feature tracks lack parallax, else None. None for rigs with a target."""
-        del converges
         return None if rig.has_target else no_parallax(rig, recordings)
 
 

@@ -1,4 +1,4 @@
-"""Initial guess of cameras with feature tracks."""
+"""Rotation and extrinsics of cameras from feature tracks, by the epipolar constraint."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from icalib.sensors.camera.stream import TrackStream, shared_rows
 # offset and up to two directions of the intrinsics. Points are not estimated. Angular rates give start values. Start
 # rotations about the main axis of the motion are tried on a grid, because a robot on a floor rotates about this axis
 # only.
+
+# Initial guess of cameras with feature tracks.
 
 PAIR_STEPS_S = (0.5, 1.0)  # s between the images of a pair; over shorter times the motion is small against ray errors
 MAX_EPIPOLAR_PAIRS = 300  # pairs of images for each of `PAIR_STEPS_S`

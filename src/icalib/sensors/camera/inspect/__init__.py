@@ -269,7 +269,6 @@ class CameraInspector(KindInspector):
     }
 
     def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, CameraSource]]:
-        """See `KindInspector`."""
         return camera_sources_of(topics)
 
     def left_out(self, topics: Sequence[TopicInfo], sensors: Mapping[str, SensorSource]) -> dict[str, str]:
@@ -311,7 +310,6 @@ class CameraInspector(KindInspector):
         return bool(cameras) and (inspection.target is not None or needed)
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
-        """See `KindInspector`."""
         source, facts = camera_sources(inspection)[name], inspection.facts[name]
         camera, imu = inspection.stream(source.topic).timing, imu_timing(inspection)
         return {

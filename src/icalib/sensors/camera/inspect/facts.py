@@ -95,12 +95,10 @@ class CameraSource(SensorSource):
 
     @property
     def topics(self) -> tuple[TopicInfo, ...]:
-        """See `SensorSource`."""
         return tuple(topic for topic in (self.images, self.corners) if topic)
 
     @property
     def read_topic(self) -> TopicInfo | None:
-        """See `SensorSource`."""
         return self.images
 
 

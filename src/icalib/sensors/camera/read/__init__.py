@@ -51,13 +51,11 @@ UNREAD = (
 
 def _corner_stamps(path: Path, layout: TableLayout) -> np.ndarray:
     """(M,) int64 ns: one stamp for each image of the corner table at `path`."""
-    del layout
     return np.unique(read_table(path, CORNER_TABLE).integers[:, 0])
 
 
 def _track_stamps(path: Path, layout: TableLayout) -> np.ndarray:
     """(M,) int64 ns: one stamp for each image of the track table at `path`."""
-    del layout
     return read_track_stamps(path)
 
 

@@ -1,9 +1,4 @@
-"""Corners of the target in the images of a recording: detected on all cores, and cached for the next run.
-
-The images are read twice: first for the cache key, which is cheap, then for the detection if the cache has no corners.
-They are read once more, for a few that are spread over the recording, if these may show another target than stated.
-Only a few images are in memory at a time.
-"""
+"""Corners of a target: from tables or found in images, checked and with even stamps."""
 
 from __future__ import annotations
 
@@ -48,6 +43,12 @@ from icalib.detection.tags import ImageWithQuads
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.sensors.camera.spec import Camera
+
+# Corners of the target in the images of a recording: detected on all cores, and cached for the next run.
+#
+# The images are read twice: first for the cache key, which is cheap, then for the detection if the cache has no
+# corners. They are read once more, for a few that are spread over the recording, if these may show another target than
+# stated. Only a few images are in memory at a time.
 
 # Share of a target's points, and number of corners of free tags, found on average in the images that show the target.
 # With fewer, the tags may have another border or layout.

@@ -1,8 +1,4 @@
-"""Feature tracks from the images of a recording: tracked on all cores, and cached for the next run.
-
-Images are tracked in segments, each on one core; tracks end at the end of a segment. Segments depend only on the
-recording, so the tracks do not depend on the number of cores.
-"""
+"""Feature tracks from images: tracked on all cores, matched in stereo, without what moves or belongs to the robot."""
 
 from __future__ import annotations
 
@@ -45,6 +41,11 @@ from icalib.errors import RecordingError
 from icalib.rig import Camera
 from icalib.sensors.camera.read.corners import camera_images, image_topic
 from icalib.sensors.camera.stream import shared_rows
+
+# Feature tracks from the images of a recording: tracked on all cores, and cached for the next run.
+#
+# Images are tracked in segments, each on one core; tracks end at the end of a segment. Segments depend only on the
+# recording, so the tracks do not depend on the number of cores.
 
 TRACKER_VERSION = 3  # of the tracker and of the cache; raise it with each change that changes tracks
 # images of a segment, and most bytes of a segment that waits in memory; larger ones are tracked on one core

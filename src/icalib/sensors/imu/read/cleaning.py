@@ -1,4 +1,4 @@
-"""Removes wrong readings of an IMU and corrects their stamps; notes tell the user about both."""
+"""Wrong readings of an IMU: copies, spikes, and units that gravity shows."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import numpy as np
 from icalib.data.measurements import ImuStream
 from icalib.data.stamps import even_stamps, followed, true_runs, usual_step
 from icalib.geometry import so3
+
+# Removes wrong readings of an IMU and corrects their stamps; notes tell the user about both.
 
 _BEYOND = 1e12  # larger readings are invalid in any unit; squares of smaller ones do not overflow
 _SENSORS = ("gyroscope", "accelerometer")

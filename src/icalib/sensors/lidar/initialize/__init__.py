@@ -31,7 +31,6 @@ class LidarInitializer(Initializer[Lidar]):
         return BY_SCANS if rig.lidars else None
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
-        del fallback
         return state_from_lidar(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -49,7 +48,6 @@ class LidarInitializer(Initializer[Lidar]):
         )
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Lidar]) -> Values:
-        del sensors
         return lidar_values(inputs, state)
 
     def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:

@@ -58,7 +58,6 @@ UNREAD = (
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
     """(S,) int64 stamps [ns] of a file of scans."""
-    del layout
     return read_scan_stamps(path)
 
 

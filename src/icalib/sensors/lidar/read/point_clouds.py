@@ -1,4 +1,4 @@
-"""Converts point cloud messages to the stream of a LiDAR."""
+"""Point clouds of messages: fields, checks, and the formats of Livox."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ from icalib.sensors.lidar.read.point_times import (
     with_even_stamps,
     without_repeats,
 )
+
+# Converts point cloud messages to the stream of a LiDAR.
 
 _N_TIMING_CLOUDS = 8  # first clouds with points, from which field and unit of point times are found
 
@@ -200,7 +202,6 @@ def _by_azimuth(sweep: SweepOrder, cloud: PointCloud, xyz: np.ndarray) -> tuple[
 
 def _by_field(times: PointTimes, cloud: PointCloud, xyz: np.ndarray) -> tuple[int, np.ndarray]:
     """Stamp [ns], and times (N,) since it [s], from the field of point times."""
-    del xyz
     return times.of(cloud.stamp_ns, cloud.points[times.field])
 
 

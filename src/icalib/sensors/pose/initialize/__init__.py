@@ -80,7 +80,6 @@ class PoseInitializer(Initializer[PoseSensor]):
         return (rig.poses[0].name,)
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
-        del fallback
         return state_from_poses(inputs)
 
     def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
@@ -134,7 +133,6 @@ class PoseInitializer(Initializer[PoseSensor]):
     ) -> EstimationError | None:
         """An error that recommends kind: absolute, if relative poses fail but the same poses converge as absolute ones;
         else None."""
-        del recordings
         first = rig.poses[0]
         if first.kind != "relative" or not converges(rig.with_sensors(replace(first, kind="absolute"))):
             return None

@@ -86,7 +86,6 @@ class PositionInitializer(Initializer[PositionSensor]):
         return (self._with_frame(rig)[0].name,)
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
-        del fallback
         sensor = inputs.rig.of(PositionSensor)[0]
         state = states_from_best(inputs, sensor, fullest_recording(inputs, sensor.name), _state_of_one)
         frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
@@ -104,7 +103,6 @@ class PositionInitializer(Initializer[PositionSensor]):
         )
 
     def fixes(self, recording: Measurements) -> list[Fixes]:
-        """See `Initializer`."""
         streams = recording.of(PositionStream)
         return [Fixes(s.seconds, s.position[:, 0] + 1j * s.position[:, 1], s.origin_ns) for s in streams]
 

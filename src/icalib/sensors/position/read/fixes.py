@@ -1,9 +1,4 @@
-"""Positions in messages of a bag, by type of message, and in sentences of NMEA 0183.
-
-ROS does not include the messages of receivers. Their definitions here have the fields in order, those of nested
-messages in place of these, which makes the same bytes. Sources: gps_msgs/GPSFix, ublox_msgs/NavPVT,
-ublox_ubx_msgs/UBXNavPVT, nmea_msgs/Sentence.
-"""
+"""Fixes of a receiver from messages, NMEA sentences and RTKLIB files."""
 
 from __future__ import annotations
 
@@ -25,6 +20,12 @@ from icalib.errors import RecordingError
 from icalib.geometry.geodesy import earth_centred, local_metres
 from icalib.sensors.position.spec import STATUSES, PositionSensor, Status
 from icalib.sensors.stream import RawReadings
+
+# Positions in messages of a bag, by type of message, and in sentences of NMEA 0183.
+#
+# ROS does not include the messages of receivers. Their definitions here have the fields in order, those of nested
+# messages in place of these, which makes the same bytes. Sources: gps_msgs/GPSFix, ublox_msgs/NavPVT,
+# ublox_ubx_msgs/UBXNavPVT, nmea_msgs/Sentence.
 
 NAVSAT, POINT, RECEIVER, SENTENCE = "navsat", "point", "receiver", "nmea"  # kinds of topics with positions alone
 NO_FIX, SINGLE, DIFFERENTIAL, FLOAT, FIXED = range(-1, len(STATUSES))
