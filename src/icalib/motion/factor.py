@@ -1,4 +1,4 @@
-"""Interface of a factor, and what factors share: residual rows, the chain rule by keyframes, sums of normal equations."""
+"""Interface of a factor, and what factors share: residual rows, the chain rule by keyframes, sums in the equations."""
 
 from __future__ import annotations
 

@@ -26,6 +26,7 @@ from icalib.estimate.residual_statistics import (
 from icalib.estimate.solver import Visit
 from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
+from icalib.observability.assessor import AssessedEstimate, assessments
 from icalib.observability.determination import Contradiction, Determined, Observability, observe
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
@@ -45,7 +46,7 @@ from icalib.result import (
 from icalib.result.calibration import Timeline, row_record, versions
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
-from icalib.validation.causes import AssessedEstimate, all_causes, scatter_warnings
+from icalib.validation.causes import all_causes, scatter_warnings
 from icalib.validation.guesses import guess_notes
 
 
@@ -70,7 +71,7 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         *grave,
         *(c.sentence for c in causes if not c.grave),
         *(sentence for sentence, _ in contradicting if sentence),
-        *_warnings(inputs, estimate, groups),
+        *_warnings(assessed),
         *scatter_warnings(factors, segments is not None, validation),
     )
     return dataclasses.replace(
@@ -93,7 +94,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         null_space=determined.fixed_directions,
         unobservable=observability.unobservable,
         fits=tuple(assessed.fits),
-        residuals=by_key(_residuals(inputs, estimate, timeline)),
+        residuals=by_key(_residuals(assessed)),
         trajectory=_trajectory(inputs, outcome.state, timeline),
         iterations=tuple(Iteration(n, s.cost, s.predicted_decrease, s.damping, s.accepted) for n, s in estimate.steps),
         converged=outcome.converged,
@@ -105,7 +106,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         rates=_rates(inputs),
         versions=versions(),
         recordings=timeline.spans,
-        planes=tuple(plane for a in assessors().values() for plane in a.planes(inputs, outcome.state)),
+        planes=tuple(plane for a in assessments(assessed) for plane in a.planes),
     )
 
 
@@ -119,11 +120,10 @@ def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) ->
 
 def _notes(assessed: AssessedEstimate) -> Iterator[str]:
     """Notes on the recordings and sensors, on ambiguous parameters, and on wrong guesses."""
-    inputs, estimate = assessed.inputs, assessed.estimate
-    yield from notes(inputs, estimate, assessed.timeline)
-    for assessor in assessors().values():
-        yield from assessor.ambiguities(inputs, estimate, assessed.fits)
-    yield from guess_notes(inputs, assessed.groups)
+    yield from notes(assessed)
+    for assessment in assessments(assessed):
+        yield from assessment.ambiguities
+    yield from guess_notes(assessed.inputs, assessed.groups)
 
 
 def _rates(inputs: Inputs) -> dict[str, float]:
@@ -274,29 +274,30 @@ def _keyframe_instants(inputs: Inputs, state: State) -> dict[str, np.ndarray]:
     return dict(pair for a in assessors().values() for pair in a.keyframe_instants(inputs, state))
 
 
-def _residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Residuals]:
+def _residuals(assessed: AssessedEstimate) -> Iterator[Residuals]:
     """Records of residuals for each sensor; a kind without records of a special form gives all rows of its factors."""
-    outcome = estimate.outcome
-    for kind, assessor in assessors().items():
-        if assessor.residuals is not None:
-            yield from assessor.residuals(inputs, estimate, timeline)
+    estimate, outcome = assessed.estimate, assessed.estimate.outcome
+    for kind, assessment in zip(assessors(), assessments(assessed), strict=True):
+        if assessment.residuals is not None:
+            yield from assessment.residuals
             continue
-        names = [s.name for s in inputs.rig.sensors.values() if s.sensor_type == kind]
+        names = [s.name for s in assessed.inputs.rig.sensors.values() if s.sensor_type == kind]
         for key, factor in estimate.problem.factors.items():
             rows = factor.rows(outcome.residuals[key], outcome.state) if factor.name in names else []
             if rows:
-                yield row_record(key[1], rows, timeline)
+                yield row_record(key[1], rows, assessed.timeline)
 
 
-def _warnings(inputs: Inputs, estimate: Estimate, groups: tuple[ParameterGroup, ...]) -> Iterator[str]:
+def _warnings(assessed: AssessedEstimate) -> Iterator[str]:
     """Warnings on convergence, measurements, sensors, and estimates that cannot be right."""
-    if not estimate.outcome.converged:
-        yield f"the solver did not converge: {estimate.outcome.status}"
-    yield from inputs.measurements.warnings
-    for assessor in assessors().values():
-        yield from assessor.warnings(inputs, estimate)
-    for assessor in assessors().values():
-        yield from assessor.value_warnings(groups)
+    outcome = assessed.estimate.outcome
+    if not outcome.converged:
+        yield f"the solver did not converge: {outcome.status}"
+    yield from assessed.inputs.measurements.warnings
+    for assessment in assessments(assessed):
+        yield from assessment.warnings
+    for assessment in assessments(assessed):
+        yield from assessment.value_warnings
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
@@ -308,16 +309,17 @@ def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
 # Notes on recordings and sensors, one sentence each.
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(assessed: AssessedEstimate) -> Iterator[str]:
     """Notes on the recordings, then on each kind of sensor."""
+    timeline = assessed.timeline
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
         number, m = f"recording {k}", timeline.parts[k - 1].measurements
         name = number if span.name == number else f"{number}, {span.name}"
         timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
         yield f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}."
-    yield from inputs.measurements.notes
-    for assessor in assessors().values():
-        yield from assessor.notes(inputs, estimate, timeline)
+    yield from assessed.inputs.measurements.notes
+    for assessment in assessments(assessed):
+        yield from assessment.notes
 
 
 # Two-fold cross-validation, in the form of the result.

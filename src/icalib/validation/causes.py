@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,10 +11,11 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Change, Segments, changes, rows_of, scatter
 from icalib.kinds import assessors
+from icalib.observability.assessor import AssessedEstimate, assessments
 from icalib.observability.determination import SIGMAS, Cause, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, relaxed
 from icalib.optim.state import Key
-from icalib.result import CrossValidation, ParameterGroup, SensorFit
+from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ratio, times
 from icalib.result.verdict import AUXILIARY
@@ -92,18 +93,16 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
     return any(c.gain >= EXPLAINS * misfit.chi2 for c in causes)
 
 
-def changing(
-    inputs: Inputs, estimate: Estimate, segments: Segments | None, misfit: Misfit, scattering: bool, timeline: Timeline
-) -> Iterator[Cause]:
+def changing(assessed: AssessedEstimate, misfit: Misfit, scattering: bool) -> Iterator[Cause]:
     """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
-    for assessor in assessors().values():
-        yield from assessor.clock_causes(inputs, estimate)
-    causes = []
-    if misfit.fits and (hit := disturbance(estimate, misfit.chi2, misfit.sensors)) is not None:
+    for assessment in assessments(assessed):
+        yield from assessment.clock_causes
+    causes, segments, timeline = list[Cause](), assessed.segments, assessed.timeline
+    if misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
     if segments is not None and (misfit.fits or scattering):
-        causes += _change(inputs, segments, misfit, timeline)
+        causes += _change(assessed.inputs, segments, misfit, timeline)
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
 
@@ -249,25 +248,6 @@ def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
 IMAGE_KINDS = ("corners", "features")
 
 
-@dataclass(frozen=True)
-class AssessedEstimate:
-    """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
-    deviations; segments: of the recording, None if it is not split."""
-
-    inputs: Inputs
-    estimate: Estimate
-    groups: tuple[ParameterGroup, ...]
-    fits: Sequence[SensorFit]
-    factor: float
-    segments: Segments | None
-    timeline: Timeline
-
-    @property
-    def misfit_factor(self) -> float:
-        """Largest ratio of a sensor's residuals to its stated noise; at least 1."""
-        return float(np.sqrt(max([1.0, *(f.chi2_per_dof or 1.0 for f in self.fits)])))
-
-
 def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
     """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
 
@@ -277,16 +257,15 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     If it is not empty, its causes are grave, and tests that these values may distort are skipped. These are tests of
     the target size, of changes over the recording, and of residuals of other kinds than IMAGE_KINDS.
     """
-    inputs, estimate = assessed.inputs, assessed.estimate
     stated, notes = _stated(assessed, against)
-    omitted = {kind for a in assessors().values() for kind in a.unreliable(inputs.rig, estimate.problem.factors)}
+    omitted = {kind for a in assessments(assessed) for kind in a.unreliable}
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known = stated
     if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
         scattering = assessed.factor > LARGE_FACTOR
-        known = [*stated, *changing(inputs, estimate, assessed.segments, misfit, scattering, assessed.timeline)]
-    both = ranked([*known, *misfit_causes(inputs, estimate, fits, explaining(known, misfit))])
+        known = [*stated, *changing(assessed, misfit, scattering)]
+    both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), explaining(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 
@@ -308,8 +287,8 @@ def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tup
         gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
         causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
     causes += scale_causes(inputs, assessed.groups, size)
-    for assessor in assessors().values():
-        causes += assessor.causes(inputs, assessed.estimate, assessed.groups, factor, None if certain else relaxed_rig)
+    for assessment in assessments(replace(assessed, relaxed_rig=None if certain else relaxed_rig)):
+        causes += assessment.causes
     explained = {key for cause in causes for key in cause.explains}
     against = tuple(c for c in against if c.key not in explained)
     causes += _contradicted(assessed, against, scale, certain or given, relaxed_rig)
@@ -408,23 +387,22 @@ MAX_VARIATION = 3.0  # mean square of a segment over that of the recording, or i
 BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
 
 
-def misfit_causes(
-    inputs: Inputs, estimate: Estimate, sensor_fits: Sequence[SensorFit], explained: bool
-) -> Iterator[Cause]:
+def misfit_causes(assessed: AssessedEstimate, explained: bool) -> Iterator[Cause]:
     """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
-    yield from (Cause(sentence, 0.0) for a in assessors().values() for sentence in a.many_rejected(sensor_fits))
-    misfit, scatter = Misfit.of(sensor_fits), _scatter_over_stated(inputs)
-    noise = list(_noise_of_imu(inputs, sensor_fits, scatter))
+    rig, fits = assessed.inputs.rig, assessed.fits
+    yield from (Cause(sentence, 0.0) for a in assessments(assessed) for sentence in a.many_rejected)
+    misfit, scatter = Misfit.of(fits), _scatter_over_stated(assessed.inputs)
+    noise = list(_noise_of_imu(assessed, scatter))
     yield from noise
     if explained:
         if misfit.fits:
             yield Cause(f"residuals are larger than the stated noise predicts: {misfit.words}.", 0.0)
         return
     if not noise or any(scatter[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
-        yield from _unknown(inputs.rig, estimate, misfit)
-    for f in sensor_fits:
-        if sentence := misfit_words(inputs.rig, f, _is_noise(estimate, f)):
+        yield from _unknown(rig, assessed.estimate, misfit)
+    for f in fits:
+        if sentence := misfit_words(rig, f, _is_noise(assessed.estimate, f)):
             yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
 
 
@@ -437,27 +415,27 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
     return assessors()[sensor.sensor_type].misfit(sensor, f, is_noise)
 
 
-def _noise_of_imu(inputs: Inputs, sensor_fits: Sequence[SensorFit], scatter: Mapping[str, float]) -> Iterator[Cause]:
+def _noise_of_imu(assessed: AssessedEstimate, scatter: Mapping[str, float]) -> Iterator[Cause]:
     """Causes that are noise of the IMU, stated too small or too large. Another noise is advised only if the readings
     show it by themselves. scatter: see `_scatter_over_stated`."""
-    imu_fits = [f for f in sensor_fits if f.kind in INERTIAL]
-    if inputs.rig.imu is None or not imu_fits:
+    imu, imu_fits = assessed.inputs.rig.imu, [f for f in assessed.fits if f.kind in INERTIAL]
+    if imu is None or not imu_fits:
         return
     small = [f for f in imu_fits if is_small(f)]
-    overstated = tuple(s for a in assessors().values() for s in a.overstated_noise(inputs.rig, sensor_fits))
+    overstated = tuple(s for a in assessments(assessed) for s in a.overstated_noise)
     if any(scatter[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
         scales = {kind: max(s, 1.0) for kind, s in scatter.items()}
-        misfit = Misfit.of(sensor_fits)
-        yield Cause(noise_words(inputs.rig.imu, scales), misfit.chi2, misfit.is_grave)
+        misfit = Misfit.of(assessed.fits)
+        yield Cause(noise_words(imu, scales), misfit.chi2, misfit.is_grave)
     elif overstated:  # the trajectory then follows the IMU, and its residuals become small
         yield from (Cause(sentence, 0.0) for sentence in overstated)
     elif small and all(scatter[f.kind] < 1.0 / CLEARLY for f in small):
         scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), scatter[f.kind]) for f in small}
-        yield Cause(noise_words(inputs.rig.imu, scales), 0.0)
+        yield Cause(noise_words(imu, scales), 0.0)
     elif small:
         sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
         yield Cause(
-            f"residuals of {inputs.rig.imu.name} are smaller than the stated noise predicts ({sizes}); standard "
+            f"residuals of {imu.name} are smaller than the stated noise predicts ({sizes}); standard "
             "deviations are too large, if anything.",
             0.0,
         )

@@ -10,7 +10,7 @@ import numpy as np
 from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
-from icalib.observability.assessor import Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
@@ -98,8 +98,12 @@ def quiet_scatter(seconds: np.ndarray, readings: np.ndarray) -> float:
     return float(np.sqrt((np.quantile(squares.mean(axis=1), QUIET, axis=0)).mean() * step))
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    residuals=residuals,
-    notes=notes,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit)

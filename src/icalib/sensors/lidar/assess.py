@@ -16,7 +16,7 @@ from icalib.estimate.problem import motion_of
 from icalib.geometry.planes import plane_of
 from icalib.motion.factor import of_type
 from icalib.motion.poses import instants, usable
-from icalib.observability.assessor import Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.optim.state import State
 from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
@@ -237,11 +237,14 @@ def length(lidar: Lidar, rig: Rig) -> str | None:
     return f"the ranges of {lidar.name}"
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    planes=planes,
-    residuals=residuals,
-    notes=notes,
-    warnings=warnings,
-    length=length,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        planes=planes(a.inputs, a.estimate.outcome.state),
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit, length=length)

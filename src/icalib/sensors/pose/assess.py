@@ -12,7 +12,7 @@ from icalib.estimate.inputs import Inputs, with_association
 from icalib.estimate.residual_statistics import Segments
 from icalib.estimate.score_test import LeftOut, score_test
 from icalib.motion.factor import Whitened, output_at, pairs_of
-from icalib.observability.assessor import Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.observability.determination import SIGMAS
 from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
@@ -156,10 +156,12 @@ def length(sensor: PoseSensor, rig: Rig) -> str | None:
     return f"the positions of {sensor.name}"
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    notes=notes,
-    inner_contradictions=inner_contradictions,
-    warnings=warnings,
-    length=length,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit, inner_contradictions=inner_contradictions, length=length)

@@ -9,7 +9,7 @@ import numpy as np
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.motion.factor import Whitened, pairs_of
-from icalib.observability.assessor import Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.result import RowResiduals, SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation, row_record
 from icalib.result.quantities import excess, times
@@ -115,10 +115,13 @@ def length(sensor: PositionSensor, rig: Rig) -> str | None:
     return f"the positions of {sensor.name}"
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    residuals=residuals,
-    notes=notes,
-    warnings=warnings,
-    length=length,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit, length=length)

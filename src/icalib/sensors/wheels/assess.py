@@ -11,7 +11,7 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry.small import is_near
 from icalib.initialize.initializer import level_sensor
 from icalib.motion.factor import of_type, pairs_of
-from icalib.observability.assessor import Assessor, Groups
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Groups
 from icalib.result import RowResiduals, SensorFit
 from icalib.result.calibration import Timeline, row_record
 from icalib.result.quantities import excess, times
@@ -196,13 +196,13 @@ def looks_like(wheels: Wheels, name: str, value: np.ndarray, estimated: np.ndarr
     return ""
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    residuals=residuals,
-    notes=notes,
-    warnings=warnings,
-    length=length,
-    sizes=sizes,
-    absurd=absurd,
-    looks_like=looks_like,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit, length=length, sizes=sizes, absurd=absurd, looks_like=looks_like)

@@ -13,7 +13,7 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.poses import instants, usable
-from icalib.observability.assessor import Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.observability.determination import Cause
 from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import State
@@ -460,19 +460,20 @@ def _seconds(estimate: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     return timeline.on_result_clock(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
 
 
-ASSESSOR = Assessor(
-    misfit=misfit,
-    residuals=residuals,
-    keyframe_instants=keyframe_instants,
-    notes=notes,
-    ambiguities=ambiguities,
-    warnings=warnings,
-    value_warnings=value_warnings,
-    causes=causes,
-    clock_causes=clock_causes,
-    unreliable=unreliable,
-    many_rejected=many_rejected,
-    overstated_noise=overstated_noise,
-    length=length,
-    is_far_guess=is_far_guess,
-)
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        ambiguities=ambiguities(a.inputs, a.estimate, a.fits),
+        warnings=warnings(a.inputs, a.estimate),
+        value_warnings=value_warnings(a.groups),
+        causes=causes(a.inputs, a.estimate, a.groups, a.factor, a.relaxed_rig),
+        clock_causes=clock_causes(a.inputs, a.estimate),
+        unreliable=unreliable(a.inputs.rig, a.estimate.problem.factors),
+        many_rejected=many_rejected(a.fits),
+        overstated_noise=overstated_noise(a.inputs.rig, a.fits),
+    )
+
+
+ASSESSOR = Assessor(assess, misfit, keyframe_instants=keyframe_instants, length=length, is_far_guess=is_far_guess)
