@@ -44,6 +44,8 @@ ORDER = (
 )  # fmt: skip
 LEVELS = {folder: level for level, folders in enumerate(ORDER, 1) for folder in folders} | {"errors": 0, "kinds": 0}
 EVERYWHERE = {"errors", "kinds"}  # `kinds` lists what the sensors do in each stage, and imports it when asked
+# Methods of a result, for users, that call a higher level when they are called.
+UPWARDS = {("result", "export"), ("result", "report")}
 ROOT_NAMES = {"__version__"}  # of icalib/__init__.py, which any module may ask for
 TOOL_FACETS = ("simulate", "inspect")
 DATA_FACETS = ("spec", "stream", "read", "simulate")
@@ -113,7 +115,7 @@ def _top(folder: str) -> list[str]:
 
 def is_forbidden(own: str, other: str) -> bool:
     """Whether a module of the folder `own` must not import from `other`."""
-    if other == own or other in EVERYWHERE:
+    if other == own or other in EVERYWHERE or (own, other) in UPWARDS:
         return False
     levels = level_of(own), level_of(other)
     if levels[0] is None or levels[1] is None or levels[1] > levels[0]:

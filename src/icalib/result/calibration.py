@@ -6,7 +6,6 @@ import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import import_module
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -373,7 +372,9 @@ class Calibration:
     def export(self, to: str, folder: str | Path) -> tuple[str, ...]:
         """Write the files of another program into `folder`; to: one of `icalib.export.formats.FORMATS`. Returns
         sentences on what the format cannot hold. Raises CalibrationError if files cannot be made or written."""
-        return import_module("icalib.export.formats").write_export(self, to, folder)  # a higher layer
+        from icalib.export.formats import write_export
+
+        return write_export(self, to, folder)
 
     def report(self, path: str | Path) -> None:
         """Write the report, a page of HTML, to `path`. Raises CalibrationError if it cannot be written, or a file that
@@ -381,7 +382,9 @@ class Calibration:
         from icalib.base.files import printable, refuse_foreign, write_sealed
 
         refuse_foreign([Path(path)], (), "choose another name")
-        write_sealed(Path(path), printable(import_module("icalib.report").report_html(self)))  # a higher layer
+        from icalib.report import report_html
+
+        write_sealed(Path(path), printable(report_html(self)))
 
     def __repr__(self) -> str:
         from icalib.result.quantities import one_line
