@@ -335,7 +335,7 @@ def test_an_interrupt_leaves_the_earlier_result(tables, tmp_path, capsys, monkey
 
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "calibration.yaml").write_bytes(sealed(b"earlier"))
-    monkeypatch.setattr(icalib.cli.console, "progress_bar", Interrupting)
+    monkeypatch.setattr(icalib.cli.console, "console_progress", Interrupting)
     assert run(tables, tmp_path) == 130
     assert re.fullmatch(r"icalib: interrupted.*\n", capsys.readouterr().err)
     assert [p.read_bytes() for p in (tmp_path / "out").iterdir()] == [sealed(b"earlier")]

@@ -55,13 +55,13 @@ def test_a_notebook_redraws_only_now_and_then(shown: list[str], monkeypatch: pyt
 
 def test_elsewhere_it_is_that_of_the_console(monkeypatch: pytest.MonkeyPatch):
     made: list[bool] = []
-    real = console.progress_bar
+    real = console.console_progress
 
     def spy(quiet: bool) -> Any:
         made.append(quiet)
         return real(quiet)
 
-    monkeypatch.setattr(console, "progress_bar", spy)
+    monkeypatch.setattr(console, "console_progress", spy)
     with icalib.progress_bar() as show:
         show("solving", 0.5)
     assert made == [False] and not console.in_notebook()

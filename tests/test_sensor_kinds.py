@@ -26,15 +26,18 @@ NAMING = {
     "initialize/assumed_motion.py",  # they are an IMU and a pose sensor
     "initialize/rig_guess.py",  # wheels that show the motion in place of the IMU
     "motion/imu_data.py",  # readings of the IMU, which link keyframes
+    "kinds.py",  # the list of all kinds
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
+    "result/saving.py",  # records of residuals that it saves
     "tools/allan/analysis.py",  # the noise of IMUs
     "tools/simulation/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario.py",
     "tools/simulation/scenario_file.py",
     "tools/simulation/writing.py",
+    "tools/view.py",  # shows what cameras, IMUs and LiDARs recorded
     "tools/simulation/corners.py",
     "tools/simulation/motion.py",
     "tools/simulation/recording.py",

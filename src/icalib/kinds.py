@@ -1,8 +1,8 @@
-"""The kinds of sensors in each stage. A new kind is a folder in `sensors/`, and an entry in these tables.
+"""The kinds of sensors in each stage: one object of each kind for each stage.
 
 Tables are filled at the first use, so that a stage loads only what it needs. This module alone may import from levels
-above the one that asks. All tables have the order of sensors in layouts and results; a kind that has no part in a stage
-is left out.
+above the one that asks. All tables have all kinds, in the order of sensors in layouts and results, but for
+`simulated_kinds`.
 """
 
 from __future__ import annotations

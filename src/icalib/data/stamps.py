@@ -1,4 +1,4 @@
-"""Checks of timestamps: unit, order, duplicates, clock jumps; time windows."""
+"""Time stamps: order, duplicates, clock jumps, even instants of readings stamped late, time windows, units; stops."""
 
 from __future__ import annotations
 
@@ -649,8 +649,6 @@ def rate_sentence(what: str, stamps_ns: np.ndarray, slowest_hz: float, fastest_h
     )
 
 
-# Plausibility checks of readings.
-#
 # Detection of stop-and-go poses: a robot that stands still while each pose is recorded.
 
 STREAM_S = 0.25  # longest step between poses of one run; longer steps are breaks

@@ -1,4 +1,5 @@
-"""Statistics of the residuals after a fit: noise, covariances and cross-validation."""
+"""Statistics of the residuals after a fit: degrees of freedom, covariances from segments and from clusters, parameters
+that change."""
 
 from __future__ import annotations
 

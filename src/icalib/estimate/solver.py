@@ -27,8 +27,6 @@ from icalib.optim.state import State
 
 # Options of the solver: when it ends, when it stops early, and what it reports.
 
-# Levenberg-Marquardt on the manifold: the loop over steps, and early stopping.
-
 # A decrease of half the chi^2 by 5e-4 is a step of at most 0.03 standard deviations, in any direction.
 CONVERGED_DECREASE = 5e-4
 ROUNDING_SHARE = 1e-11  # of the cost: rounding error of a sum of 1e6 squares

@@ -181,7 +181,7 @@ NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 
 def initializer(kind: str) -> Initializer[Any]:
-    """The initializer of a kind of sensor; `NO_INITIALIZER` if the kind has none."""
+    """The initializer of a kind of sensor."""
     return initializers()[kind]
 
 

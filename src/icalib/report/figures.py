@@ -184,9 +184,9 @@ class ResidualCloud:
 def curves(c: Calibration, r: Residuals) -> Iterator[ResidualCurve]:
     """Curves of one residual record as its kind of sensor defines them; by default one whitened curve for each column
     of `RowResiduals`."""
-    own = presenters()[c.rig["sensors"][r.sensor]["type"]].curves
-    if own is not None:
-        yield from own(r)
+    of_kind = presenters()[c.rig["sensors"][r.sensor]["type"]].curves
+    if of_kind is not None:
+        yield from of_kind(r)
     elif isinstance(r, RowResiduals):
         for k, label in enumerate(r.labels):
             yield ResidualCurve(label, r.seconds, r.whitened[:, k : k + 1], (f"{label}, whitened",))

@@ -9,7 +9,7 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 
 # True length / length in the rig file, of all lengths of the target.
 SIZE = ParameterSpec("size", 1, "nuisance", "", ("size",), 1e-2, 0.1)
-# Magnitude of gravity, see `rig.gravity`; it belongs to the WORLD.
+# Magnitude of gravity, see `Gravity`; it belongs to the WORLD.
 WORLD = "world"
 GRAVITY = ParameterSpec("gravity", 1, "nuisance", "m/s^2", ("gravity",), 0.05, 0.1)
 # Out-of-plane deviation of a body from its design, second order in x, y; basis: `model.bodies.shape_basis`.

@@ -1,8 +1,4 @@
-"""The kinds of sensors: one folder each. A new kind is a new folder and one entry in `SENSOR_KINDS`.
-
-Three things of a kind are registered elsewhere. A kind that gives the motion needs a rank, one of the BY_... in
-`initialize/initializer.py`. Parameters of the scene belong to `SCENE` in `rig/scene.py`. A simulated kind needs
-a free `random_stream`; `CONTRIBUTING.md` lists those taken.
+"""The kinds of sensors: one folder each. `CONTRIBUTING.md` lists what a new kind has, and where it is registered.
 
 A facet is a module or package of a fixed name in the folder of a kind that serves one stage of the program: see
 `FACETS`. It holds one object of the class that the stage defines; `kinds.py` lists these objects.

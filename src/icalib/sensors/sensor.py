@@ -143,7 +143,7 @@ class Sensor:
 
     @property
     def has_frame(self) -> bool:
-        """Whether the sensor reports in a static frame whose pose in the world is estimated, see `model.frames`."""
+        """Whether the sensor reports in a static frame whose pose in the world is estimated, see `icalib.model`."""
         return False
 
     @property

@@ -41,8 +41,8 @@ from icalib.sensors.position.stream import PositionStream
 #
 # at the instant of the fix on the IMU's clock. The IMU's readings propagate the trajectory to that instant; fixes are
 # never interpolated. Parameters: translation (p_imu_sensor) and time_offset of the sensor, and those of its frame in
-# each recording. These are frame_yaw or frame_rotation with frame_translation, or the tilt of the target: see `frame`.
-# A slow offset of the fixes adds to e: see `walk_factor`.
+# each recording. These are frame_yaw or frame_rotation with frame_translation, or the tilt of the target: `frame.py`.
+# A slow offset of the fixes adds to e: see `OffsetWalkFactor`.
 
 # Fixes further from every keyframe are left out, because residuals neglect the propagated IMU noise. A poor
 # accelerometer, of 0.01 m/s^2/sqrt(Hz), adds 1 mm to a position over this time.

@@ -1,8 +1,7 @@
 """Initial guess of cameras: intrinsics, distortion, extrinsics, time offsets, and the trajectory from their images.
 
-The guess comes from images of a target (`boards`) or from feature tracks (`tracks`).
-
-Detects feature tracks without parallax, which leave the translation of cameras unobservable.
+The guess comes from images of a target (`target_with_imu`) or from feature tracks (`from_tracks`). Tracks without
+parallax leave the translation of cameras unobservable.
 
 Extrinsics of cameras by hand-eye calibration with the trajectory of a LiDAR or a pose sensor.
 

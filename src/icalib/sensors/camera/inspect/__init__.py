@@ -1,7 +1,4 @@
-"""Finds cameras in a recording for `icalib inspect`: images, tables of corners and tracks, and what they show.
-
-Finds cameras among the topics of a recording. Tables of cameras for the terminal.
-"""
+"""Finds cameras in a recording for `icalib inspect`: images, tables of corners and tracks, and what they show."""
 
 from __future__ import annotations
 
