@@ -20,14 +20,8 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import (
-    ASSOCIATION_ROUNDS,
-    associate,
-    check_shares,
-    lidar_and_motion,
-    lidar_on_motion,
-    round_search,
-)
+from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, check_shares, round_search
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.residual import LidarFactor
 
 pytestmark = pytest.mark.slow

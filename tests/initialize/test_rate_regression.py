@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from icalib.data.measurements import ImuStream
-from icalib.initialize.hand_eye import MIN_REGRESSION_SCORE, best_regressions, no_match_error
 from icalib.initialize.rate_correlation import SensorRates
+from icalib.initialize.rate_regression import MIN_REGRESSION_SCORE, best_regressions, no_match_error
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
 from icalib.tools.simulation.motion import rotation_from_vector

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from icalib.observability.determination import Cause
+from icalib.observability.assessor import Cause
 from icalib.result import SensorFit
 from icalib.sensors.camera.assess import image_velocity
 from icalib.validation.causes import Misfit, are_noise, explaining, ranked

@@ -15,7 +15,6 @@ import numpy as np
 
 from icalib.errors import EstimationError
 from icalib.geometry.small import MEDIAN_NORM
-from icalib.initialize.hand_eye import MeanRates, no_match_error, rate_difference_noise
 from icalib.initialize.rate_correlation import (
     RATE_MEAN_S,
     ChainedRates,
@@ -25,6 +24,7 @@ from icalib.initialize.rate_correlation import (
     likely_offsets,
     moving_means,
 )
+from icalib.initialize.rate_regression import MeanRates, no_match_error, rate_difference_noise
 from icalib.motion.imu_data import ImuData, other_axes
 
 MAX_UNEXPLAINED_RATE = 0.35  # unexplained share of the angular rate above which the motions differ

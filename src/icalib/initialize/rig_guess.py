@@ -33,7 +33,8 @@ from icalib.initialize.initializer import (
     place_sensors,
     refusing_far_off,
 )
-from icalib.observability.determination import Contradiction, Determined, contradicted_by, determine
+from icalib.observability.contradictions import Contradiction, contradicted_by
+from icalib.observability.determination import Determined, determine
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.memory import trim_heap
 from icalib.optim.state import State

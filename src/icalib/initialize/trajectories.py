@@ -11,8 +11,8 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.small import hermite, once_integrated
-from icalib.initialize.hand_eye import Triples
 from icalib.initialize.initializer import KnownExtrinsics
+from icalib.initialize.lever_arm import Triples
 from icalib.initialize.rate_alignment import (
     RateAlignment,
     align_rates,

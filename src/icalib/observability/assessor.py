@@ -12,7 +12,6 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Segments
 from icalib.kinds import assessors
-from icalib.observability.determination import Cause
 from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import Key, State
 from icalib.result import ParameterGroup, SensorFit
@@ -24,6 +23,18 @@ S = TypeVar("S", bound=Sensor)
 Groups = Mapping[Key, ParameterGroup]
 Sentences = Iterable[str]
 Keyed = Iterable[tuple[str, np.ndarray]]  # each with a sentence or the key of a stream
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A possible cause. sentence: the fault, and what to do about it; gain: the decrease of chi^2 if it is modelled;
+    grave: whether the result must not be used; explains: parameter groups whose stated values contradict the data for
+    this cause, so that the contradiction needs no other sentence."""
+
+    sentence: str
+    gain: float
+    grave: bool = False
+    explains: tuple[Key, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,8 @@ from icalib.estimate.solver import Visit
 from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
 from icalib.observability.assessor import AssessedEstimate, assessments
-from icalib.observability.determination import Contradiction, Determined, Observability, observe
+from icalib.observability.contradictions import Contradiction
+from icalib.observability.determination import Determined, Observability, observe
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (

@@ -9,10 +9,11 @@ import numpy as np
 
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
-from icalib.estimate.residual_statistics import Change, Segments, changes, rows_of, scatter
+from icalib.estimate.parameter_changes import Change, changes, scatter
+from icalib.estimate.residual_statistics import Segments, rows_of
 from icalib.kinds import assessors
-from icalib.observability.assessor import AssessedEstimate, assessments
-from icalib.observability.determination import SIGMAS, Cause, Contradiction, contradictions
+from icalib.observability.assessor import AssessedEstimate, Cause, assessments
+from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, relaxed
 from icalib.optim.state import Key
 from icalib.result import CrossValidation, SensorFit

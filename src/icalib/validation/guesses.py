@@ -16,7 +16,8 @@ from icalib.geometry.small import is_near
 from icalib.initialize.initializer import is_contradicted
 from icalib.kinds import assessors
 from icalib.model.bodies import SIZE
-from icalib.observability.determination import Cause, Contradiction
+from icalib.observability.assessor import Cause
+from icalib.observability.contradictions import Contradiction
 from icalib.result import ParameterGroup
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig

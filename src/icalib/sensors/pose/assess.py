@@ -13,7 +13,7 @@ from icalib.estimate.residual_statistics import Segments
 from icalib.estimate.score_test import LeftOut, score_test
 from icalib.motion.factor import Whitened, output_at, pairs_of
 from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
-from icalib.observability.determination import SIGMAS
+from icalib.observability.contradictions import SIGMAS
 from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation

@@ -13,8 +13,7 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.poses import instants, usable
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
-from icalib.observability.determination import Cause
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
 from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import State
 from icalib.result import ParameterGroup, SensorFit

@@ -19,7 +19,7 @@ from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import Adjusted, ImagePoints, adjust, fit_rays, initial_parameters
 from icalib.motion.factor import of_type, pairs_of
-from icalib.observability.determination import Cause
+from icalib.observability.assessor import Cause
 from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import Key, State
 from icalib.result import ParameterGroup, SensorFit

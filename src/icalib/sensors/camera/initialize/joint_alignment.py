@@ -26,9 +26,9 @@ from icalib.data.measurements import TrackStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras.base import CameraModel
-from icalib.initialize.hand_eye import MIN_REGRESSION_SCORE, best_regressions
 from icalib.initialize.rate_alignment import MIN_SECOND_AXIS_RATIO, RateAlignment, only_axis
 from icalib.initialize.rate_correlation import GyroRotation, SensorRates
+from icalib.initialize.rate_regression import MIN_REGRESSION_SCORE, best_regressions
 from icalib.motion.imu_data import ImuData
 from icalib.optim.arrowhead import complement
 from icalib.sensors.camera.initialize.epipolar import (

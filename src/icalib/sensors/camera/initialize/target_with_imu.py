@@ -22,8 +22,8 @@ from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.hand_eye import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
 from icalib.initialize.initializer import merged_translation, merged_value
+from icalib.initialize.lever_arm import LeverArm, check_gravity, check_target_size, solve_camera_lever_arm
 from icalib.initialize.rate_alignment import RateAlignment
 from icalib.initialize.rate_correlation import GyroRotation
 from icalib.motion.imu_data import ImuData, imu_data

@@ -28,9 +28,9 @@ from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.geometry.cameras.convert import fit_rays
-from icalib.initialize.hand_eye import MeanRates, best_regressions
 from icalib.initialize.rate_alignment import RateAlignment, covered, kabsch, no_overlap
 from icalib.initialize.rate_correlation import GyroRotation, SensorRates
+from icalib.initialize.rate_regression import MeanRates, best_regressions
 from icalib.motion.imu_data import ImuData
 from icalib.rig import Camera
 from icalib.sensors.camera.initialize.epipolar import ImagePairs, ray_derivatives, rotation_information_of_pairs

@@ -15,7 +15,6 @@ from icalib.estimate.estimate import first_pass
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry import so3
-from icalib.initialize.hand_eye import TARGET_SIZE_TOLERANCE, scale_by_accelerometer
 from icalib.initialize.initializer import (
     BY_POSES,
     Initializer,
@@ -34,6 +33,7 @@ from icalib.initialize.initializer import (
     stated_values,
     states_from_best,
 )
+from icalib.initialize.lever_arm import TARGET_SIZE_TOLERANCE, scale_by_accelerometer
 from icalib.initialize.rate_alignment import RateAlignment
 from icalib.initialize.rate_correlation import GyroRotation, SensorRates
 from icalib.initialize.smooth_trajectory import BodyPoses, smooth_trajectory

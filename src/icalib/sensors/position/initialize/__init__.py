@@ -18,7 +18,6 @@ from icalib.estimate.estimate import first_pass
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.estimate.problem import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.geometry import so3
-from icalib.initialize.hand_eye import Triples
 from icalib.initialize.initializer import (
     BY_POSITIONS,
     Fixes,
@@ -37,6 +36,7 @@ from icalib.initialize.initializer import (
     stated_values,
     states_from_best,
 )
+from icalib.initialize.lever_arm import Triples
 from icalib.initialize.rate_correlation import best_shifts, closest_of_equals
 from icalib.model.sensor_model import frame_of
 from icalib.motion.imu_data import ImuData

@@ -24,7 +24,7 @@ import numpy as np
 
 from icalib.geometry import so3
 from icalib.geometry.small import once_integrated, twice_integrated
-from icalib.initialize.hand_eye import Triples
+from icalib.initialize.lever_arm import Triples
 from icalib.initialize.rate_correlation import CorrelationPeak, best_shifts
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.sensors.position.read import steps
