@@ -1,7 +1,7 @@
 """Frontal elimination of a chain whose keyframes share features, each seen from many keyframes (iCalib paper (15),
 Schur complement).
 
-`front_plan.py` chooses the elimination order; `front_kernels.py` and `front_substitution.py` have the compiled steps.
+The elimination order comes first; `front_kernels.py` has the compiled steps.
 The cost of a step grows with the square of the number of features in the front.
 """
 

@@ -5,7 +5,7 @@
 K is the camera model, and P the point in the world frame. Points are not part of the state. Every linearisation first
 moves each point to the minimum of its cost (variable projection; Golub and Pereyra 1973). Points are eliminated from
 the normal equations together with the keyframes that observe them (`optim/front.py`). Points on planes of LiDARs have
-an additional residual (`surfaces.py`).
+an additional residual (`track_surfaces.py`).
 
 Images of one camera in a range of keyframes: observations of tracks, poses, and projections of points.
 """
