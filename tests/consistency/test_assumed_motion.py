@@ -189,7 +189,7 @@ def test_what_wheels_do_not_show_to_cameras_that_follow_points(example, drive, w
         calibrate_measurements(rig, measurements)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_nees(robot):
     """Of what does not hang on the slip that the rig file allows for, and simulated wheels do not have: yaw, pitch and
     sideways are known far better than their standard deviations say."""
@@ -204,7 +204,7 @@ def test_nees(robot):
     assert low < np.sum(runs) < high, np.array(runs) / len(seen)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_nees_of_a_camera_and_wheels(robot):
     """Wheels as free of slip as simulated ones."""
     scenario, seen, runs = robot("ramp", 30.0, "cw"), np.array([0, 3, 5, 6, 7, 8, 9]), []

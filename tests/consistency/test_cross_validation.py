@@ -148,7 +148,7 @@ def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[...
     assert points.unit == "m" and points.rms_inside == pytest.approx(points.rms_outside, rel=0.01)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_with_all_that_is_on_by_default_and_noise_alone():
     """The robust loss and noise found from residuals leave it near 1."""
     scenario = handheld(12.0)

@@ -109,7 +109,7 @@ def test_a_noisy_imu_does_not_make_it_up(kind: str):
     check(kind, "noisy", 1)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("imu", ["datasheet", "noisy"])
 @pytest.mark.parametrize("kind", ["handheld", "planar", "single_axis", "motionless"])
 def test_no_confident_wrong_number_in_a_hundred(kind: str, imu: ImuQuality):

@@ -26,7 +26,7 @@ def test_a_few_recordings(consistency, asynchronous: bool, imu: ImuQuality):
     check(consistency, asynchronous, imu, range(6), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize(("asynchronous", "imu"), CONFIGURATIONS)
 def test_fifty_recordings(consistency, asynchronous: bool, imu: ImuQuality):
     check(consistency, asynchronous, imu, range(50), 0.95)

@@ -108,7 +108,7 @@ def test_planes_are_those_of_the_recording():
     assert fit.count > 100 and 0.5 < not_none(fit.chi2_per_dof) < 1.6
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_the_height_between_them_is_as_well_known_as_it_says():
     z = []
     for seed in range(100, 124):
@@ -118,7 +118,7 @@ def test_the_height_between_them_is_as_well_known_as_it_says():
     assert low < np.sum(np.square(z)) < high, z
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_in_free_motion_everything_is_as_well_known_as_it_says():
     samples = []
     for seed in range(24):

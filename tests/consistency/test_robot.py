@@ -82,13 +82,13 @@ def test_a_recording_of_all_sensors(consistency, robot):
     check(consistency, robot, replace(ALL, seconds=20.0, azimuth_steps=300), range(1), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("case", [WHEELS, LIDAR, ALL], ids=["wheels", "LiDAR", "all"])
 def test_fifty_recordings(consistency, robot, case: Case):
     check(consistency, robot, case, range(50), 0.99)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_fifty_recordings_whose_planes_are_found(consistency, robot):
     check(consistency, robot, FOUND, range(50), 0.99, Measurements.unassociated)
 
@@ -162,7 +162,7 @@ def test_a_flat_floor_with_no_guess_at_all(robot):
     assert (np.abs(off) < 2.0 * wheels.std_formal).all()
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("parts", ["cw", "clw", "l"])
 def test_flat_floors(robot, parts: str, seed: int):
@@ -240,7 +240,7 @@ def test_points_that_hit_something_else(robot):
     check_outliers(robot, 0, displaced, replace(FOUND, seconds=10.0, azimuth_steps=300))
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("damage", [displaced, passed_by])
 def test_a_tenth_of_the_points_are_outliers(robot, damage, seed: int):
@@ -259,7 +259,7 @@ def test_wheels_that_slide_sideways(robot):
     check_slip(robot, 1.25, 0)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("degrees", [0.5, 1.25])  # at the drives' 0.9 m/s or so 4 and 10 mm/s RMS
 def test_drives_with_sideslip(robot, degrees: float, seed: int):

@@ -215,7 +215,7 @@ def test_a_few_recordings_are_consistent(consistency, with_grid: bool):
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_fifty_recordings_are_consistent(consistency):
     scenario = tag_map(10.0, with_grid=True)
     assert isinstance(scenario.target, Scene)

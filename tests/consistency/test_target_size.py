@@ -80,7 +80,7 @@ def test_with_noise_it_is_off_by_what_is_said(said):
     assert chi2.ppf(0.001, len(z)) < z @ z < chi2.ppf(0.999, len(z))
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("said", [1.0, 0.95])
 def test_over_many_recordings_it_is_off_by_what_is_said(said):
     z = np.array(excess(range(100, 150), said))

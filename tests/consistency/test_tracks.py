@@ -127,7 +127,7 @@ def test_outliers_are_set_aside_and_little_else(stated: bool):
         assert r.sigma[0] == pytest.approx(1.0, abs=0.03) and fit.chi2_per_dof == pytest.approx(0.97, abs=0.05)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_many_recordings_with_outliers(consistency):
     scenario = table2(10.0)
     found = consistency(scenario, follower(scenario, 1.02), range(24), 0.99, seen=lost)
@@ -139,6 +139,6 @@ def test_a_few_recordings(consistency):
     check(consistency, 8.0, range(3), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_many_recordings(consistency):
     check(consistency, 10.0, range(24), 0.99)

@@ -83,7 +83,7 @@ def test_what_is_known_is_right_and_nothing_creeps(motion: str, noise: float, se
 
 @pytest.mark.parametrize(
     ("motion", "seed"),
-    [("single-axis", 1), ("single-axis", 3), pytest.param("standing", 1, marks=pytest.mark.statistical)],
+    [("single-axis", 1), ("single-axis", 3), pytest.param("standing", 1, marks=pytest.mark.full)],
 )
 def test_lenses_owe_to_the_guess_what_they_follow_it_by(motion: str, seed: int):
     """Time offsets that are all wrong together, or a robot that stands, moved lenses by up to 9 standard deviations."""

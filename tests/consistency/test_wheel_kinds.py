@@ -47,7 +47,7 @@ def test_a_few_recordings(consistency, robot, reports):
     check(consistency, robot, reports, range(3), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("reports", KINDS)
 def test_fifty_recordings(consistency, robot, reports):
     check(consistency, robot, reports, range(50), 0.99)

@@ -86,7 +86,7 @@ def test_lever_arm_and_clock_from_nothing(motion):
     assert std[3] < 4e-3
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("motion", ["free", "ramps"])
 def test_errors_are_as_large_as_their_covariance_says(motion):
     nees = []
