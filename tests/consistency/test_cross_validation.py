@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.consistency.conftest import make_robot
+from tests.consistency.recordings import make_robot
 from tests.consistency.test_several_recordings import pair
 from tests.consistency.test_without_imu import alone, stereo
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.consistency.test_unobservable_motion import thin
+from tests.consistency.recordings import thin
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import estimate

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from tests.consistency.test_robot import steady
+from tests.consistency.recordings import steady
 
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
