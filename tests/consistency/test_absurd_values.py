@@ -102,7 +102,7 @@ def test_what_is_merely_wrong_is_estimated_with_it(robot, solved, times, named):
 
 def test_a_prior_that_is_far_off_gives_way(robot):
     """The radii do not end up on the other side of zero, from where nothing leads back."""
-    rig, measurements, truth = measured(*drive(robot, "lw"))
+    rig, measurements, truth = measured(*drive(robot, "cw"))
     true = not_none(truth.wheels[0].radii.value)
     result = calibrate_measurements(with_value(rig, "radii", 10.0 * true, 1e-3), measurements)
     (words,) = [w for w in result.warnings if "the prior of radii" in w]

@@ -13,6 +13,8 @@ from icalib.observability import determination
 from icalib.pipeline import calibrate_measurements
 from icalib.tools.simulation import rig_for, simulate, with_drawn_guess
 
+pytestmark = pytest.mark.full
+
 AXIS = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])  # of examples/paper/single-axis.yaml
 RECORDINGS = 6
 

@@ -108,7 +108,7 @@ def _lost(stream: TrackStream, rng: np.random.Generator) -> TrackStream:
     return replace(stream, uv=uv)
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_outliers_are_set_aside_and_little_else(stated: bool):
     scenario = table2(8.0)
     rig = with_drawn_guess(follower(scenario, 1.0), scenario, 2)
@@ -135,6 +135,7 @@ def test_many_recordings_with_outliers(consistency):
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 
+@pytest.mark.full
 def test_a_few_recordings(consistency):
     check(consistency, 8.0, range(3), 0.9999)
 
