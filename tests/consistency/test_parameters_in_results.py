@@ -22,7 +22,7 @@ pytestmark = pytest.mark.slow
 
 
 def test_every_parameter_of_a_robot_is_in_its_result(robot):
-    scenario = robot("ramp", 18.0, "clw", 100)
+    scenario = robot("ramp", 20.0, "clw")
     T = scenario.cameras[0].T_imu_sensor
     scenario = scenario.with_sensors(SimPoses("mocap0", T), SimPositions("gnss0", T))
     rig, simulation = rig_for(scenario, intrinsics="free", distortion="free"), simulate(scenario, 0)
