@@ -20,7 +20,7 @@ from icalib.rig import Parameter, Rig
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Features, Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 
 PAPER = Path(__file__).parents[2] / "examples" / "paper"

@@ -15,15 +15,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.initialize.rate_alignment import align_rates
 from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import ImuStream, Measurements, PoseStream
-from icalib.initialize.steps.rate_alignment import align_rates
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import ImuNoise, ImuSensor, Parameter, PoseKind, PoseSensor, Rig, by_name
-from icalib.sensors.pose.initialize.extrinsics import pose_rates
+from icalib.sensors.pose.initialize import pose_rates
 
 ALIASED = ImuNoise(3e-3, 2.2e-5, 0.1, 8.6e-4, source="tests")
 FIRST_ROW = {"hkumars": 0, "kangminsu1": 75}  # of the poses, that belongs to the first stamp

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from icalib.detection.detectors import detector_of
 
-from icalib.detection.boards.detectors import detector_of
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
 from icalib.tools.simulation import Imaging, Picture, Renderer, Sheet, handheld
-from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.scenario import SimCamera
 
 cv2 = pytest.importorskip("cv2")
 

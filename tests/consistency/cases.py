@@ -21,7 +21,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Simulation, rig_for
 
 MOST_SIGMA = 4.0

@@ -11,8 +11,7 @@ from tests.consistency.recordings import make_robot
 from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
-from icalib.tools.montecarlo.one_run import compare
-from icalib.tools.montecarlo.record import RunRecord
+from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Scenario, simulate
 

@@ -11,7 +11,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.initialize import attempts
+from icalib.initialize import rig_guess
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
 from icalib.tools.simulation import Scenario, rig_for, simulate
@@ -28,8 +28,8 @@ def solved(monkeypatch) -> list[Rig]:
         rigs.append(inputs.rig)
         return determine(inputs, *others, **more)
 
-    determine = attempts.determine
-    monkeypatch.setattr(attempts, "determine", noting)
+    determine = rig_guess.determine
+    monkeypatch.setattr(rig_guess, "determine", noting)
     return rigs
 
 

@@ -12,9 +12,9 @@ from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Lidar
-from icalib.sensors.lidar.read.checks import Sieve, checked_lidar, sifted
-from icalib.sensors.lidar.read.scan_order import selected
-from icalib.sensors.lidar.read.scans import in_seconds
+from icalib.sensors.lidar.read import in_seconds
+from icalib.sensors.lidar.read.point_clouds import Sieve, checked_lidar, sifted
+from icalib.sensors.lidar.read.point_times import selected
 from icalib.tools.simulation import Simulation, rig_for, simulate
 
 RNG = np.random.default_rng(0)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from icalib.pipeline import calibrate_measurements
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.full

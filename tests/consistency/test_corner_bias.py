@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.detection.detectors import detector_of
+from icalib.sensors.camera.corner_bias import predicted_curvature
+from icalib.tools.simulation.rendering import Imaging, exposure_poses
 
-from icalib.detection.boards.detectors import detector_of
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard
-from icalib.sensors.camera.edge_curvature import predicted_curvature
 from icalib.tools.simulation import HandheldMotion, film, handheld
-from icalib.tools.simulation.images.rendering import Imaging, exposure_poses
 
 pytest.importorskip("cv2")
 

@@ -15,7 +15,7 @@ from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, CrossValidation
 from icalib.rig import Camera, Rig, Settings
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, with_drawn_guess
 
 SEEDS = range(6)

@@ -13,12 +13,11 @@ from tests.typed import not_none
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
-from icalib.report.tables import size_words
+from icalib.report.page import size_words
 from icalib.result import Calibration
 from icalib.rig import Camera, PoseSensor, Rig, by_name
 from icalib.tools.simulation import handheld, rig_for, simulate
-from icalib.validation.assess import few_segments_notes
-from icalib.validation.variance_parts import few_factor
+from icalib.validation.assess import few_factor, few_segments_notes
 
 LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 2e-4, 2e-5)}
 CAMERA, POSE_SENSOR = Camera("cam0", "", "pinhole-radtan", (752, 480)), PoseSensor("mocap", "")

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import Step, minimise
 
 from icalib.estimate.estimate import Callbacks
-from icalib.estimate.problem.outcome import Step
-from icalib.estimate.problem.solver import minimise
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability import determination, prior_sensitivity
 from icalib.observability.determination import determine

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from icalib.estimate.jacobian_noise import spurious_information
 from tests.consistency.recordings import thin
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import estimate
-from icalib.estimate.residual_statistics.jacobian_noise import spurious_information
 from icalib.observability import determination
 from icalib.pipeline import calibrate_measurements
 from icalib.tools.simulation import rig_for, simulate, with_drawn_guess

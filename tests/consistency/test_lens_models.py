@@ -11,7 +11,7 @@ from icalib.data.measurements import CornerStream, Measurements
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Rig
-from icalib.sensors.camera.assess import lens_models
+from icalib.sensors.camera.assess import lenses
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 WIDE = ("eucm", (430.0, 429.0, 371.0, 245.0), (0.62, 1.09))
@@ -108,18 +108,18 @@ def test_models_are_compared_by_the_corners_of_the_detector(monkeypatch):
     edges = np.tile(np.array([-30.0, 0.0, 30.0, 0.0, 0.0, 60.0, 0.0], dtype=np.float32), (len(stream.uv), 2, 1))
     measurements = Measurements.of_streams(dataclasses.replace(stream, edges=edges))
     given = []
-    monkeypatch.setattr(lens_models, "compare_models", lambda *args: given.append(args) or (None, None))
+    monkeypatch.setattr(lenses, "compare_models", lambda *args: given.append(args) or (None, None))
     result = calibrate_measurements(rig, measurements)
     ((factor, out, state, settings, noise),) = given
     np.testing.assert_array_equal(factor.stream.uv, stream.uv)
     monkeypatch.undo()
-    all_own, all_best = lens_models.compare_models(factor, out, state, settings, noise)
+    all_own, all_best = lenses.compare_models(factor, out, state, settings, noise)
     assert all_own is not None and all_best is not None
     (residuals,) = result.corner_residuals
     size = np.linalg.norm(residuals.residual, axis=1)
     large = size > np.quantile(size, 0.8)  # as if the own model had rejected what it cannot follow
     root = np.where(large, 0.0, out.root)
-    own, best = lens_models.compare_models(factor, dataclasses.replace(out, root=root), state, settings, noise)
+    own, best = lenses.compare_models(factor, dataclasses.replace(out, root=root), state, settings, noise)
     for fewer, whole in ((own, all_own), (best, all_best)):
         assert fewer is not None
         assert fewer.model is whole.model

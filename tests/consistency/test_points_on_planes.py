@@ -14,7 +14,7 @@ from tests.typed import not_none
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.sensors.lidar.simulate import SimLidar
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.montecarlo.summary import Sample, nees
 from icalib.tools.simulation import Scenario, Simulation, load_scenario, rig_for, simulate, with_drawn_guess
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.trajectory import DriveKind
 from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
@@ -14,9 +15,8 @@ from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import relative_poses
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.one_run import error, true_value
+from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, rig_for, simulate
-from icalib.tools.simulation.scenario.robot import DriveKind
 
 ROOM = Room((8.0, 6.0, 3.0))
 NOISE = {"absolute": (2e-3, 1e-3), "relative": (5e-3, 1e-2)}

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.projection import project
 from scipy.spatial.transform import Rotation
 
 import icalib
@@ -14,7 +15,6 @@ from icalib.geometry.targets import Charuco, Checkerboard, Target
 from icalib.result import Calibration
 from icalib.rig import Rig, Settings
 from icalib.tools.simulation import Film, Scenario, Truth, film, handheld, rig_for, tag_map, write_film
-from icalib.tools.simulation.scenario.projection import project
 from icalib.tools.simulation.writing import FORMS, Form
 
 pytest.importorskip("cv2")

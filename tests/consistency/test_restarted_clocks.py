@@ -14,7 +14,7 @@ from tests.typed import instance
 
 from icalib.data.measurements import WheelStream
 from icalib.errors import EstimationError, RecordingError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, joint_covariance, load_calibration

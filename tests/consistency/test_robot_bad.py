@@ -20,7 +20,7 @@ from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
 from icalib.sensors.lidar.initialize import association as association_rounds
-from icalib.tools.montecarlo.one_run import true_value
+from icalib.tools.montecarlo.record import true_value
 from icalib.tools.simulation import Simulation, rig_for, simulate, with_drawn_guess
 
 MOUNTS = ("rotation", "translation", "time_offset")

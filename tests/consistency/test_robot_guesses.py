@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import Inputs
 
 from icalib.errors import CalibrationError
-from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry import so3
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.optim.state import State

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.initialize.scene_intrinsics import check_bodies_still, find_scene, scene_error_ratios
 from scipy.spatial.transform import Rotation
 
 from icalib.data.measurements import CornerStream, Measurements
@@ -17,8 +18,7 @@ from icalib.model.bodies import Bodies
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.connected_bodies import choose_bodies, restrict
-from icalib.sensors.camera.initialize.boards.scene_intrinsics import check_bodies_still, find_scene, scene_error_ratios
+from icalib.sensors.camera.model import choose_bodies, restrict
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate, tag_map
 
 

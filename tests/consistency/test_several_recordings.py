@@ -13,7 +13,7 @@ from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, ImuStream
 from icalib.errors import EstimationError, RecordingError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig

@@ -13,7 +13,7 @@ from tests.consistency.recordings import steady
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
-from icalib.tools.montecarlo.one_run import compare
+from icalib.tools.montecarlo.record import compare
 from icalib.tools.simulation import Scenario, Simulation, rig_for, simulate
 
 MONTH_NS = 30 * 86_400 * 10**9 + 123_456_789

@@ -14,13 +14,13 @@ from tests.consistency.test_pose_sensors import pose
 
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig
 from icalib.sensors.parameter import fixed
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.montecarlo.one_run import error
+from icalib.tools.montecarlo.record import error
 from icalib.tools.simulation import Drive, Scenario, handheld, rig_for, simulate
 
 MOUNT, FRAME = pose([0.3, -0.5, 1.0], [0.1, -0.2, 0.15]), pose([0.2, 0.1, 2.0], [3.0, -1.0, 0.5])

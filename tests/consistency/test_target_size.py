@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.score_test import TargetSize, target_size
 from scipy.stats import chi2
 from tests.typed import instance
 
-from icalib.estimate.residual_statistics.target_size import TargetSize, target_size
 from icalib.geometry.targets import AprilGrid, Markers
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import determine

@@ -7,18 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for, origin_difference
+from icalib.estimate.solver import SolverOptions, minimise
 from scipy.spatial.transform import Rotation
 from tests.typed import not_none
 
 from icalib.data.measurements import Measurements, TrackStream
-from icalib.estimate.problem.assembly import assemble, keyframe_times, keyframes_for, resample
-from icalib.estimate.problem.inputs import inputs_for, origin_difference
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.solver_options import SolverOptions
+from icalib.estimate.problem import assemble, keyframe_times, keyframes_for, resample
 from icalib.geometry.targets import NoTarget
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
+from icalib.sensors.camera.initialize import initial_guesses, initial_state
 from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 

@@ -42,7 +42,7 @@ from tests.consistency.recordings import (
 from tests.typed import not_none
 
 from icalib.data.measurements import PoseStream
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.initialize.assumed_motion import _with_rate
 from icalib.pipeline import calibrate_measurements
 from icalib.result import load_calibration

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from icalib.data.measurements import Measurements
 from icalib.errors import EstimationError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, load_calibration
 from icalib.rig import Rig

@@ -13,9 +13,8 @@ from tests.position.test_position_runs import antenna, errors, recorded
 from icalib.optim.state import State, make_layout
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Settings
-from icalib.sensors.position.fix_errors import bursts_of, outliers_of
+from icalib.sensors.position.residual import OffsetWalk, bursts_of, knot_entries, knot_keys, outliers_of
 from icalib.sensors.position.stream import PositionStream
-from icalib.sensors.position.walk_factor import OffsetWalk, knot_entries, knot_keys
 from icalib.tools.simulation import rig_for, simulate
 
 WALK = 0.02  # m/sqrt(s)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from icalib.tools.simulation.room import hills_of_slope
 from scipy.stats import chi2
 
 from icalib.errors import EstimationError
@@ -18,7 +19,6 @@ from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.simulate import SimPositions
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation import Drive, Room, Scenario, Simulation, rig_for, simulate
-from icalib.tools.simulation.scenario.room import hills_of_slope
 
 pytestmark = pytest.mark.slow
 

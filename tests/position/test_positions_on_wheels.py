@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.trajectory import DriveKind
 from scipy.stats import chi2
 from tests.position.test_position_runs import ARM, antenna, pose
 
 from icalib.errors import EstimationError, RigError
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate, calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
@@ -19,7 +20,6 @@ from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.inspection import draft_rig, inspect_recording
 from icalib.tools.simulation import Drive, Room, Scenario, Simulation, rig_for, simulate, write_tables
-from icalib.tools.simulation.scenario.robot import DriveKind
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from tests.position.test_position_runs import ARM
 from tests.position.test_shared_frames import SILENT, with_mocap, with_target
 
-from icalib.export.outputs import write_outputs
+from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE

@@ -14,7 +14,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.stream import PositionStream
 from icalib.tools.simulation import Drive, Room, Scenario, rig_for, simulate
-from icalib.tools.simulation.scenario.scenario import SimCamera
+from icalib.tools.simulation.scenario import SimCamera
 
 pytestmark = pytest.mark.slow
 
