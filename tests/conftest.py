@@ -26,7 +26,7 @@ IMAGES = "detection"  # folder of tests that find targets, by kernels of their o
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Marks whole runs and studies as slow, and brings files in the order in which workers are to take them."""
     for item in items:
-        if item.path.parent.name in WHOLE_RUNS or item.get_closest_marker("statistical"):
+        if item.path.parent.name in WHOLE_RUNS or item.get_closest_marker("full"):
             item.add_marker(pytest.mark.slow)
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     place = {path: k for k, path in enumerate(_in_order(list(dict.fromkeys(item.path for item in items)), slow))}

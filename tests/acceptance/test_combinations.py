@@ -52,17 +52,20 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
     return ""
 
 
+def in_ci(sees: str, imu: bool, others: str, known: str) -> bool:
+    """Pairs of sensors beside or without the IMU, from nothing; all sensors together, from each kind of guess."""
+    count = bool(sees) + len(others.split("+") if others else ())
+    return (known == "nothing" and count <= 2) or (imu and sees == "board" and others == SUBSETS[-1])
+
+
 def combinations() -> list[Any]:
-    """All that have a sensor beside the IMU. Guesses beside a LiDAR, which take longest, are tried with all sensors
-    only, unless long tests are asked for."""
+    """All that have a sensor beside the IMU; those that are not `in_ci` are marked as full."""
     found = []
     for imu, sees, others, known in product((True, False), SEES, SUBSETS, KNOWN):
         if not (sees or others) or (known == "lenses" and not sees):
             continue
-        some = "lidar" in others and others != SUBSETS[-1] and known != "nothing"
-        long = some and not refusal(sees, imu, others, known)
         name = "-".join([sees or "no camera", *(["imu"] if imu else []), *([others] if others else []), known])
-        marks = [pytest.mark.statistical] if long else []
+        marks = [] if in_ci(sees, imu, others, known) else [pytest.mark.full]
         found.append(pytest.param(sees, imu, others, known, id=name, marks=marks))
     return found
 

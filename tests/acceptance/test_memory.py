@@ -28,6 +28,7 @@ KEYFRAME_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
 LEAST, MOST = 0.75, 1.2  # of what is needed: work space and what the allocator holds are much the same in both
 
 
+@pytest.mark.full
 @pytest.mark.skipif(sys.platform != "linux", reason="peak memory in kilobytes, and an allocator that gives back")
 def test_memory_grows_with_what_corners_and_keyframes_need(tmp_path: Path) -> None:
     _peak(tmp_path, 10.0)  # compiles what is not yet compiled

@@ -128,6 +128,7 @@ def test_residuals_are_white_or_said_not_to_be(logs, absolute):
         assert abs((clipped[1:] * clipped[:-1]).sum() / (clipped**2).sum()) < 0.15
 
 
+@pytest.mark.full
 def test_relative_poses_agree_with_absolute_ones(logs, absolute):
     _, measured, _ = logs
     relative = calibrated(measured, "relative")

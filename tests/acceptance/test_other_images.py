@@ -22,6 +22,9 @@ def _stills_module():
     return module
 
 
+pytestmark = pytest.mark.full
+
+
 @pytest.fixture(scope="module")
 def stills(aprilgrid_images) -> dict:
     return _stills_module().calibrate_stills(aprilgrid_images)

@@ -32,7 +32,13 @@ def calibrated(model: str, folder: Path, pictures: Path) -> Calibration:
     return calibrate(load_rig(rig), pictures)
 
 
-@pytest.mark.parametrize("model", ["pinhole-equidistant", "eucm", "double-sphere", "pinhole-radtan5"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        "pinhole-equidistant",
+        *(pytest.param(m, marks=pytest.mark.full) for m in ("eucm", "double-sphere", "pinhole-radtan5")),
+    ],
+)
 def test_lenses_that_fit_leave_less_than_the_shipped_solutions(folder, aprilgrid_images, model):
     result = calibrated(model, folder, aprilgrid_images)
     assert result.converged, result.status

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.consistency.test_assumed_motion import mocap, without_imu
-from tests.consistency.test_wheel_kinds import reporting
+from tests.consistency.recordings import mocap, reporting, without_imu
 from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
@@ -60,8 +59,8 @@ def drive(robot, kind: str) -> tuple[Scenario, bool]:
 
 ABSURD = {
     "baseline in mm": ("cw", "baseline", 1e3, "It looks like millimetres"),
-    "baseline in inches": ("lw", "baseline", 1.0 / 0.0254, "It looks like inches"),
-    "diameter": ("lw", "radii", 2.0, "It looks like a diameter"),
+    "baseline in inches": ("cw", "baseline", 1.0 / 0.0254, "It looks like inches"),
+    "diameter": ("cw", "radii", 2.0, "It looks like a diameter"),
     "rates in rpm": ("cw", "radii", 30.0 / np.pi, "Its readings look like rpm"),
     "lever arm in mm": ("cw", "translation", 1e3, "It looks like millimetres"),
     "without IMU": ("mocap", "radii", 1e3, "It looks like millimetres"),
@@ -103,7 +102,7 @@ def test_what_is_merely_wrong_is_estimated_with_it(robot, solved, times, named):
 
 def test_a_prior_that_is_far_off_gives_way(robot):
     """The radii do not end up on the other side of zero, from where nothing leads back."""
-    rig, measurements, truth = measured(*drive(robot, "lw"))
+    rig, measurements, truth = measured(*drive(robot, "cw"))
     true = not_none(truth.wheels[0].radii.value)
     result = calibrate_measurements(with_value(rig, "radii", 10.0 * true, 1e-3), measurements)
     (words,) = [w for w in result.warnings if "the prior of radii" in w]

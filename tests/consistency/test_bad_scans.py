@@ -23,7 +23,7 @@ RNG = np.random.default_rng(0)
 @pytest.fixture(scope="module")
 def drive(robot) -> Simulation:
     """A LiDAR and an IMU."""
-    return simulate(robot("3d", 16.0, "l", 200), 1)
+    return simulate(robot("3d", 13.0, "l", 200), 1)
 
 
 def damaged(lidar: LidarStream) -> LidarStream:
@@ -50,7 +50,7 @@ def calibrated(simulation: Simulation, lidar: LidarStream) -> tuple[Calibration,
 
 
 def test_no_result_moves_by_a_standard_deviation(drive):
-    """Four of 127 scans are more than one in a hundred."""
+    """Four of 103 scans are more than one in a hundred."""
     lidar = drive.measurements.lidars[0]
     own = replace(lidar, offset_s=lidar.offset_s.copy(), xyz=lidar.xyz.copy(), plane=lidar.plane.copy())
     (clean, nothing), (found, notes) = calibrated(drive, own), calibrated(drive, damaged(lidar))

@@ -16,6 +16,8 @@ from icalib.pipeline import calibrate_measurements
 from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
+pytestmark = pytest.mark.full
+
 SCENARIO = Path(__file__).parents[2] / "examples" / "paper" / "table2-3d.yaml"
 NOISY = {"imu": ("gyro", "accel"), "tracks": ("uv",), "lidars": ("xyz",), "wheels": ("pose",)}
 

@@ -74,6 +74,7 @@ def test_noiseless_images_give_the_truth(front: int):
     np.testing.assert_allclose(found, T, atol=1e-8)
 
 
+@pytest.mark.full
 def test_the_covariance_is_honest():
     squares = []
     for seed in range(6):

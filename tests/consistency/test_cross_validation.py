@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.consistency.conftest import make_robot
+from tests.consistency.recordings import make_robot
 from tests.consistency.test_several_recordings import pair
 from tests.consistency.test_without_imu import alone, stereo
 
@@ -41,6 +41,7 @@ def honest() -> list[CrossValidation]:
     return [held(run(handheld(12.0), seed)) for seed in SEEDS]
 
 
+@pytest.mark.full
 def test_where_noise_is_all_there_is_it_is_as_expected(honest: list[CrossValidation]):
     """Over all seeds within 3 standard deviations, each within 4; and neither by being too wide."""
     excess, expected = (sum(getattr(h, name) for h in honest) for name in ("excess", "expected"))
@@ -51,6 +52,7 @@ def test_where_noise_is_all_there_is_it_is_as_expected(honest: list[CrossValidat
     assert all(0.5 < h.factor < 1.5 for h in honest)
 
 
+@pytest.mark.full
 def test_what_moves_without_a_part_is_as_allowed(honest: list[CrossValidation]):
     """Without each of 8 parts, 32 parameters that correlate: the mean square over 6 seeds has about 6 x 7 x 10 free."""
     z = np.concatenate([h.whitened for h in honest])
@@ -58,6 +60,7 @@ def test_what_moves_without_a_part_is_as_allowed(honest: list[CrossValidation]):
     assert np.mean(z**2) == pytest.approx(1.0, abs=0.3)
 
 
+@pytest.mark.full
 def test_residuals_that_took_part_are_smaller_than_predicted_ones(honest: list[CrossValidation]):
     """Of corners, which carry most of it; RMS and chi^2 tell the same."""
     for h in honest:
@@ -148,7 +151,7 @@ def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[...
     assert points.unit == "m" and points.rms_inside == pytest.approx(points.rms_outside, rel=0.01)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_with_all_that_is_on_by_default_and_noise_alone():
     """The robust loss and noise found from residuals leave it near 1."""
     scenario = handheld(12.0)
@@ -163,6 +166,7 @@ def _unstated(camera: Camera) -> Camera:
     return replace(camera, corner_noise_px=None)
 
 
+@pytest.mark.full
 def test_a_half_that_knows_planes_badly_is_no_alarm():
     """A LiDAR on a vehicle on a flat floor, its planes found in the clouds. Measured residuals of the other half rise
     by 175 where noise makes them rise by 167 +- 34, and all errors are honest."""

@@ -23,6 +23,10 @@ LENS = {"intrinsics": (458.7, 457.3, 367.2, 248.4), "distortion": (-0.28, 0.07, 
 CAMERA, POSE_SENSOR = Camera("cam0", "", "pinhole-radtan", (752, 480)), PoseSensor("mocap", "")
 
 
+# Images; so few that their spread tells little, and in `full` so many that it tells more.
+COUNTS = [9, *(pytest.param(n, marks=pytest.mark.full) for n in (4, 16))]
+
+
 def stills(count: int, seed: int, shared_px: float) -> Calibration:
     rig, stream = taken(count, seed, shared_px)
     return calibrate_measurements(rig, Measurements.of_streams(stream))
@@ -60,7 +64,7 @@ def rms(values: list[list[float]]) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-@pytest.mark.parametrize("count", [4, 9, 16])
+@pytest.mark.parametrize("count", COUNTS)
 def test_errors_that_an_image_shares_are_covered(count: int):
     results = [stills(count, seed, 0.15) for seed in range(6)]
     assert rms([in_deviations(r, formal=True) for r in results]) > 1.7
@@ -68,7 +72,7 @@ def test_errors_that_an_image_shares_are_covered(count: int):
     assert not any("too short for segments" in w for r in results for w in r.warnings)
 
 
-@pytest.mark.parametrize("count", [4, 9, 16])
+@pytest.mark.parametrize("count", COUNTS)
 def test_white_noise_costs_little_more_than_students_t(count: int):
     results = [stills(count, seed, 0.0) for seed in range(6)]
     factors = [float(not_none(r.group("cam0", "intrinsics").factor)[0]) for r in results]

@@ -35,7 +35,7 @@ def test_of_an_estimate_that_failed_no_answers_are_looked_for(robot, monkeypatch
 def test_held_directions_are_moved_in_the_estimate_without_them(robot):
     """From the guess the way down is another with fewer directions free, and may end elsewhere: seed 1002 of the
     planar scenario of Table II did."""
-    scenario = robot("planar", 12.0, "lw")
+    scenario = robot("planar", 6.0, "lw")
     simulation = simulate(scenario, 0)
     rig = with_drawn_guess(rig_for(scenario), scenario, 0)
     inputs, state, guess = guess_of_rig(rig, [simulation.measurements])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.consistency.test_unobservable_motion import thin
+from tests.consistency.recordings import thin
 from threadpoolctl import threadpool_limits
 
 from icalib.estimate.estimate import estimate
@@ -12,6 +12,8 @@ from icalib.estimate.jacobian_noise import spurious_information
 from icalib.observability import determination
 from icalib.pipeline import calibrate_measurements
 from icalib.tools.simulation import rig_for, simulate, with_drawn_guess
+
+pytestmark = pytest.mark.full
 
 AXIS = np.array([0.2, -0.1, 1.0]) / np.linalg.norm([0.2, -0.1, 1.0])  # of examples/paper/single-axis.yaml
 RECORDINGS = 6

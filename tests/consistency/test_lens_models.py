@@ -63,7 +63,9 @@ def test_where_the_model_does_not_follow_the_lens_another_is_named():
     assert better.fits[-1].rms == pytest.approx(0.2, rel=0.05)
 
 
-@pytest.mark.parametrize(("lens", "model"), [(NARROW, "pinhole-radtan"), (WIDE, "eucm")])
+@pytest.mark.parametrize(
+    ("lens", "model"), [(NARROW, "pinhole-radtan"), pytest.param(WIDE, "eucm", marks=pytest.mark.full)]
+)
 def test_gross_outliers_are_rejected_with_a_note(lens: tuple, model: str):
     rig, measurements, wrong = stills(lens, model, 2, outliers=0.02)
     result = calibrate_measurements(rig, measurements)

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.consistency.test_assumed_motion import check_known, mocap, without_imu
+from tests.consistency.cases import Run, known
+from tests.consistency.recordings import mocap, without_imu
 
 from icalib.data.measurements import Measurements, WheelStream
 from icalib.errors import EstimationError
@@ -36,7 +37,7 @@ def said(result: Calibration) -> tuple[list[str], list[str]]:
 def test_a_level_frame_tells_swapped_wheels(robot):
     rig, measurements, simulation = without_imu(robot("ramp", 15.0, "w").with_sensors(level()))
     result = calibrate_measurements(rig, measurements)
-    check_known(result, simulation, 10)
+    known(10)(Run(simulation, rig, result))
     assert said(result) == ([], [])
     with pytest.raises(
         EstimationError, match="left and right wheels are swapped.* signs to .-1, -1. .*level: false for m"
@@ -51,6 +52,7 @@ def test_a_level_frame_tells_swapped_wheels(robot):
     )
 
 
+@pytest.mark.full
 def test_signs_put_swapped_wheels_right(robot):
     """The frame then looks backwards, and each radius is that of the wheel on the other side."""
     rig, measurements, simulation = without_imu(robot("ramp", 15.0, "w").with_sensors(level()))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from tests.consistency.test_assumed_motion import without_imu
+from tests.consistency.recordings import without_imu
 from tests.consistency.test_level_frame import level
 from tests.initialize.test_pose_conventions import conjugated, inverted, w_first, y_up
 
@@ -18,7 +18,7 @@ WRONG = [
 ]
 
 
-@pytest.fixture(scope="module", params=["planar", "ramp"])
+@pytest.fixture(scope="module", params=["planar", pytest.param("ramp", marks=pytest.mark.full)])
 def recorded(request, robot):
     return without_imu(robot(request.param, 12.0, "w").with_sensors(level()))
 

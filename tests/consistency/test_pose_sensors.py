@@ -84,6 +84,7 @@ def test_beside_a_camera_it_is_recovered(kind):
     assert [r.name for r in relative_poses(result)] == ["T_cam0_mocap0"]
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
 def test_errors_are_as_the_covariance_says(kind, consistency):
     """Six seeds, noise found from the residuals; 20 seeds by hand gave 0.98 and 1.04 per degree of freedom."""

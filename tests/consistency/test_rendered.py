@@ -104,7 +104,9 @@ def test_what_the_lens_bends_within_a_window_is_all_that_distortion_is_off(
     assert abs(result.group("cam0", "bloom").value[0]) < 0.005
 
 
-@pytest.mark.parametrize("form", [f for f in FORMS if f != "ros1"])
+@pytest.mark.parametrize(
+    "form", ["mcap", *(pytest.param(f, marks=pytest.mark.full) for f in FORMS if f not in ("ros1", "mcap"))]
+)
 def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form, Path], result: Calibration):
     other = icalib.calibrate(rig, recordings[form])
     for ours, theirs in zip(result.groups, other.groups, strict=True):
@@ -118,7 +120,11 @@ def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form
 
 
 @pytest.mark.parametrize(
-    "target", [Charuco(8, 6, 0.08, 0.06, "4x4_50"), Checkerboard(6, 9, 0.06)], ids=lambda t: t.type
+    "target",
+    [
+        pytest.param(Charuco(8, 6, 0.08, 0.06, "4x4_50"), id="charuco", marks=pytest.mark.full),
+        pytest.param(Checkerboard(6, 9, 0.06), id="checkerboard"),
+    ],
 )
 def test_other_targets_and_an_exposure(target: Target, scenario: Scenario, tmp_path: Path):
     """Their points are numbered as the target's, or nothing would fit; some images show a board in part."""
@@ -134,6 +140,7 @@ def test_other_targets_and_an_exposure(target: Target, scenario: Scenario, tmp_p
     assert fit.rms is not None and fit.rms < 0.05
 
 
+@pytest.mark.full
 def test_a_room_with_tags_and_a_grid(tmp_path: Path):
     """From images to the calibration and where everything stands; only the lens is given."""
     room = tag_map(8.0, with_grid=True)

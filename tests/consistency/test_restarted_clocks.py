@@ -75,7 +75,8 @@ def check_offsets(result: Calibration, simulations: tuple[Simulation, ...]) -> N
 
 
 @pytest.mark.parametrize(
-    ("example", "parts", "azimuth_steps"), [("3d", "c", 0), ("3d", "l", 300), ("ramp", "clw", 300)]
+    ("example", "parts", "azimuth_steps"),
+    [("ramp", "cw", 0), *(pytest.param(*x, marks=pytest.mark.full) for x in (("3d", "l", 300), ("ramp", "clw", 300)))],
 )
 def test_each_recording_has_its_own(robot, example, parts, azimuth_steps):
     simulations = pair(robot, example, parts, azimuth_steps)
@@ -164,6 +165,7 @@ def test_a_recording_with_nothing_of_a_sensor_is_named(robot):
         calibrate_measurements(open_rig(scenario, ""), [simulate(scenario, 1).measurements, blind])
 
 
+@pytest.mark.full
 def test_cameras_that_follow_points(robot):
     """Without a target: tracks of both recordings, the second camera's clock set back between them."""
     scenario = replace(load_scenario(PAPER / "table2-3d.yaml"), sensors=(), duration_s=8.0)
@@ -180,7 +182,7 @@ def test_cameras_that_follow_points(robot):
     assert len(result.group(first.name, "time_offset").value) == 1
 
 
-@pytest.mark.parametrize("parts", ["c", ""])
+@pytest.mark.parametrize("parts", ["", pytest.param("c", marks=pytest.mark.full)])
 def test_a_pose_sensor(robot, parts):
     """Beside a camera, and as what shows the motion."""
     scenario = robot("3d", 14.0, parts).with_sensors(mocap())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -57,8 +58,13 @@ def wrong(sensor: Sensor, what: str) -> dict[str, np.ndarray]:
     return {"time_offset": t + {"seconds": 3.0, "hours": 7200.0}[what]}
 
 
-@pytest.mark.parametrize("kind", ["wheels", "poses"])
-@pytest.mark.parametrize("what", ["inverse", "link", "millimetres", "seconds", "hours"])
+IN_CI = {("wheels", "link"), ("wheels", "millimetres"), ("wheels", "hours"), ("poses", "inverse"), ("poses", "seconds")}
+WRONG = list(product(("wheels", "poses"), ("inverse", "link", "millimetres", "seconds", "hours")))
+
+
+@pytest.mark.parametrize(
+    ("kind", "what"), [pytest.param(*x, marks=() if x in IN_CI else pytest.mark.full) for x in WRONG]
+)
 def test_a_wrong_guess_is_replaced(simulation, kind, what):
     rig = rig_for(simulation.scenario, **STARTS)
     sensor = getattr(rig, kind)[0]
@@ -90,7 +96,7 @@ def drawn(rig: Rig, rng: np.random.Generator) -> Rig:
     return rig
 
 
-@pytest.mark.parametrize("seed", range(24))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(k, marks=pytest.mark.full) for k in range(6, 24))])
 def test_no_guess_ends_the_first_guess_but_in_a_sentence(simulation, seed):
     rig = drawn(rig_for(simulation.scenario, **STARTS), np.random.default_rng(seed))
     try:
@@ -102,7 +108,7 @@ def test_no_guess_ends_the_first_guess_but_in_a_sentence(simulation, seed):
     assert all(np.isfinite(v).all() for v in state.values.values())
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.full) for k in (1, 2))])
 def test_no_guess_spoils_the_calibration(simulation, seed):
     rig = rig_for(simulation.scenario, **STARTS)
     truth, result = rig, calibrate_measurements(drawn(rig, np.random.default_rng(seed)), simulation.measurements)

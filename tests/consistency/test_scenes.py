@@ -61,9 +61,9 @@ def scene_errors(result: Calibration, simulation: Simulation) -> list[float]:
     return errors
 
 
-@pytest.mark.parametrize("with_grid", [False, True], ids=["tags", "tags and a grid"])
+@pytest.mark.parametrize("with_grid", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_noiseless_scenes_are_recovered_from_nothing(with_grid: bool):
-    simulation = simulate(tag_map(15.0, noiseless=True, with_grid=with_grid), 0)
+    simulation = simulate(tag_map(8.0, noiseless=True, with_grid=with_grid), 0)
     result = calibrate_measurements(free(simulation.scenario), simulation.measurements)
     assert result.converged, result.status
     assert set(result.bodies) == set(simulation.scenario.target.bodies)
@@ -86,7 +86,7 @@ def test_a_scene_without_an_imu():
 
 def test_recordings_that_show_different_tags_share_one_scene():
     """Eight of the twelve tags each, four in both."""
-    simulations = [simulate(tag_map(12.0, noiseless=True), seed) for seed in (0, 1)]
+    simulations = [simulate(tag_map(8.0, noiseless=True), seed) for seed in (0, 1)]
     tags = simulations[0].scenario.target.body
     kept = (lambda q: tags[q] < 8, lambda q: tags[q] >= 4)
     recordings = [seen_only(s.measurements, k) for s, k in zip(simulations, kept, strict=True)]
@@ -98,7 +98,7 @@ def test_recordings_that_show_different_tags_share_one_scene():
 
 def moved_between(step: list[float], noiseless: bool) -> tuple[Rig, list[Measurements]]:
     """Two recordings; in the second every other tag is moved by `step` [m]."""
-    simulations = [simulate(tag_map(12.0, noiseless=noiseless), seed) for seed in (0, 1)]
+    simulations = [simulate(tag_map(8.0, noiseless=noiseless), seed) for seed in (0, 1)]
     poses = simulations[1].scenario.T_world_bodies
     assert poses is not None
     moved = poses.copy()
@@ -160,14 +160,14 @@ def test_a_wrong_lens_is_no_change_of_the_scene():
 
 def test_of_three_recordings_the_one_that_was_changed_is_named():
     rig, (old, new) = moved_between([0.0, 0.02, 0.03], noiseless=False)
-    third = dataclasses.replace(simulate(tag_map(12.0), 2).measurements, name="third")
+    third = dataclasses.replace(simulate(tag_map(8.0), 2).measurements, name="third")
     bodies, recordings = chosen(rig, [old, new, third])
     with pytest.raises(EstimationError, match="^new: the poses of the targets relative to each other"):
         check_bodies_still(rig, find_scene(rig, bodies, recordings), recordings)
 
 
 def test_tags_that_no_image_ties_to_the_others_are_left_out_and_named():
-    simulation = simulate(tag_map(12.0, noiseless=True), 0)
+    simulation = simulate(tag_map(8.0, noiseless=True), 0)
     tags = simulation.scenario.target.body
 
     def wanted(point: np.ndarray) -> np.ndarray:
@@ -200,13 +200,14 @@ def merge(a: CornerStream, b: CornerStream) -> CornerStream:
 
 
 def test_the_size_of_tags_shows_against_the_imu():
-    simulation = simulate(tag_map(12.0), 0)
+    simulation = simulate(tag_map(8.0), 0)
     rig = rig_for(simulation.scenario)
     small = dataclasses.replace(simulation.scenario.target, size=0.12)
     with pytest.raises(EstimationError, match=r"times as large as in the rig file"):
         calibrate_measurements(dataclasses.replace(rig, target=small), simulation.measurements)
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("with_grid", [False, True], ids=["tags", "tags and a grid"])
 def test_a_few_recordings_are_consistent(consistency, with_grid: bool):
     scenario = tag_map(8.0, with_grid=with_grid)
@@ -215,7 +216,7 @@ def test_a_few_recordings_are_consistent(consistency, with_grid: bool):
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_fifty_recordings_are_consistent(consistency):
     scenario = tag_map(10.0, with_grid=True)
     assert isinstance(scenario.target, Scene)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from tests.consistency.test_robot import steady
+from tests.consistency.recordings import steady
 
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
@@ -58,7 +58,7 @@ def worlds(result: Calibration) -> set[str]:
 
 
 def test_a_lidar_alone_finds_the_planes_of_each_recording(robot):
-    simulations = pair(robot, "3d", (12.0, 9.0), "l", 300)
+    simulations = pair(robot, "3d", (9.0, 7.0), "l", 300)
     rig = rig_for(simulations[0].scenario)
     result = calibrate_measurements(rig, [s.measurements.unassociated() for s in simulations])
     check(result, simulations[0])
@@ -69,6 +69,7 @@ def test_a_lidar_alone_finds_the_planes_of_each_recording(robot):
         assert (result.group("lidar0", name).std_formal < single.group("lidar0", name).std_formal).all()
 
 
+@pytest.mark.full
 def test_all_sensors_with_planes_that_are_known(robot):
     simulations = pair(robot, "ramp", (18.0, 20.0), "clw", 300)
     rig = steady(rig_for(simulations[0].scenario))

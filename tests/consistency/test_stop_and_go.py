@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2
-from tests.consistency.test_assumed_motion import T_OTHER, mocap
+from tests.consistency.recordings import T_OTHER, mocap
 from tests.consistency.test_pose_sensors import pose
 
 from icalib.data.measurements import Measurements, PoseStream

@@ -107,7 +107,7 @@ def _lost(stream: TrackStream, rng: np.random.Generator) -> TrackStream:
     return replace(stream, uv=uv)
 
 
-@pytest.mark.parametrize("stated", [False, True])
+@pytest.mark.parametrize("stated", [False, pytest.param(True, marks=pytest.mark.full)])
 def test_outliers_are_set_aside_and_little_else(stated: bool):
     scenario = table2(8.0)
     rig = with_drawn_guess(follower(scenario, 1.0), scenario, 2)
@@ -126,7 +126,7 @@ def test_outliers_are_set_aside_and_little_else(stated: bool):
         assert r.sigma[0] == pytest.approx(1.0, abs=0.03) and fit.chi2_per_dof == pytest.approx(0.97, abs=0.05)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_many_recordings_with_outliers(consistency):
     scenario = table2(10.0)
     found = consistency(scenario, follower(scenario, 1.02), range(24), 0.99, seen=lost)
@@ -134,10 +134,11 @@ def test_many_recordings_with_outliers(consistency):
     assert {block: c for block, c in found.items() if not c.consistent} == {}
 
 
+@pytest.mark.full
 def test_a_few_recordings(consistency):
     check(consistency, 8.0, range(3), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_many_recordings(consistency):
     check(consistency, 10.0, range(24), 0.99)

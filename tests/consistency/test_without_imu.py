@@ -59,6 +59,7 @@ def test_noiseless_images_give_the_truth():
         assert np.abs(error).max() < EXACT * (460.0 if name == "intrinsics" else 1.0)
 
 
+@pytest.mark.full
 def test_the_covariance_is_honest():
     """NEES of everything that is estimated, over twelve recordings."""
     total, dof = 0.0, 0

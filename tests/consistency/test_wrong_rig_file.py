@@ -44,7 +44,7 @@ def test_the_right_noise_is_no_news(simulation):
     assert said(with_noise(simulation, 1.0)) == []
 
 
-@pytest.mark.parametrize("times", [3.0, 10.0])
+@pytest.mark.parametrize("times", [10.0, pytest.param(3.0, marks=pytest.mark.full)])
 def test_corner_noise_that_is_far_too_large_is_no_fault_of_the_imu(simulation, times):
     """Residuals of the IMU are then small, too, as the motion follows it."""
     rig = rig_for(simulation.scenario)
@@ -55,7 +55,7 @@ def test_corner_noise_that_is_far_too_large_is_no_fault_of_the_imu(simulation, t
     assert [f"cam0 {1.0 / times:.2g}x and cam1 {1.0 / times:.2g}x" in w for w in result.warnings].count(True) == 1
 
 
-@pytest.mark.parametrize("times", [0.2, 0.1, 0.05, 0.01])
+@pytest.mark.parametrize("times", [0.2, 0.05, *(pytest.param(x, marks=pytest.mark.full) for x in (0.1, 0.01))])
 def test_noise_that_is_far_too_small_is_said(simulation, times):
     """The motion then follows the IMU, and hardly any degrees of freedom are left to judge it by."""
     result = with_noise(simulation, times)
@@ -65,7 +65,7 @@ def test_noise_that_is_far_too_small_is_said(simulation, times):
     assert result.wrong == ((words,) if times < 0.2 else ())
 
 
-@pytest.mark.parametrize("times", [0.5, 0.1])
+@pytest.mark.parametrize("times", [0.1, pytest.param(0.5, marks=pytest.mark.full)])
 def test_noise_that_is_stated_too_small_is_that_of_the_readings(simulation, times):
     """To two fifths. Calibrated with it there is nothing left to say."""
     (words,) = said(with_noise(simulation, times))
@@ -120,7 +120,7 @@ GUESSES: list[dict[str, Any]] = [
 ]
 
 
-@pytest.mark.parametrize("modes", GUESSES)
+@pytest.mark.parametrize("modes", [GUESSES[0], *(pytest.param(modes, marks=pytest.mark.full) for modes in GUESSES[1:])])
 def test_cameras_that_are_mixed_up_are_named(simulation, modes):
     rig = rig_for(simulation.scenario, distortion="free", **modes)
     words = "cam0 and cam1 seem to be swapped"

@@ -124,7 +124,7 @@ def test_a_few_recordings(robot, room_of, name):
     check_nees(robot, room_of, name, range(3), 0.9999)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["table2-3d", "table2-ramp"])
 def test_fifty_recordings(robot, room_of, name):
     check_nees(robot, room_of, name, range(50), 0.99)

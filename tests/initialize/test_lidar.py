@@ -187,7 +187,7 @@ def test_one_wall_does_not_crash(free_robot):
         assert within(free_robot, found, 1e-3, 1e-3, 1e-9)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("example", ["table2-3d", "table2-ramp"])
 def test_many_recordings(robot, example):
     for seed in range(20):

@@ -163,7 +163,7 @@ def test_one_wall_is_one_plane(free_robot):
     assert found.association.points[0] > 0.8 * len(alone.xyz)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize(
     ("example", "turn", "way", "late", "wrong"),
     [("table2-3d", 0.02, 3e-3, 1e-4, 0.005), ("table2-ramp", 0.1, 5e-3, 3e-4, 0.01)],

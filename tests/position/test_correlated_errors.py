@@ -103,7 +103,7 @@ def test_a_slow_offset_that_is_not_modelled_is_named():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [11, 13, 17])
+@pytest.mark.parametrize("seed", [11, *(pytest.param(k, marks=pytest.mark.full) for k in (13, 17))])
 def test_bursts_of_wrong_fixes_are_rejected(seed):
     """A fifth of the fixes is off by metres, for 4 s on average."""
     error, std, _, result = walking(seed, 0.0, 0.0, bursts=0.2)
@@ -112,14 +112,14 @@ def test_bursts_of_wrong_fixes_are_rejected(seed):
     assert any("outliers" in note for note in result.notes)
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_errors_with_a_slow_offset_are_as_large_as_their_covariance_says():
     found = [walking(seed, WALK)[2] for seed in range(20)]
     low, high = chi2.ppf([0.005, 0.995], 4 * len(found)) / len(found)
     assert low < np.mean(found) < high
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 def test_multipath_is_mostly_covered_by_the_walk_that_the_warning_advises():
     """Gauss-Markov errors of 5 cm and 3 s. Over a short time they are a random walk of D sqrt(2 / T). The density that
     is advised is a fifth smaller. Formal standard deviations are still too small, printed ones are not."""

@@ -67,6 +67,7 @@ def test_without_noise():
     assert any("gnss0 translation z: not determined by this motion" in reason for reason in result.reasons)
 
 
+@pytest.mark.full
 def test_errors_are_as_large_as_their_covariance_says():
     """Nothing is stated: no size of the wheels, no lever arm, no time offset."""
     nees = []
@@ -79,9 +80,9 @@ def test_errors_are_as_large_as_their_covariance_says():
     assert low < np.mean(nees) < high
 
 
-def test_a_longer_drive_and_wrong_sizes():
+def test_wrong_sizes():
     """Dead reckoning with these sizes would be off by 90 deg in each turn."""
-    sim = driven(2, 120.0)
+    sim = driven(2)
     sizes = {"radii": Parameter("free", np.array([0.12, 0.12])), "baseline": Parameter("free", np.array([0.38]))}
     error, covariance = errors(calibrated(sim, **sizes), sim, "radii", "baseline")
     assert (np.abs(error) < 3.5 * np.sqrt(np.diag(covariance))).all()

@@ -92,7 +92,7 @@ def test_a_known_frame_tells_more_than_one_that_is_estimated():
     assert result.group("gnss0", "translation").verdict == ("determined",) * 3
 
 
-@pytest.mark.statistical
+@pytest.mark.full
 @pytest.mark.parametrize("frame", MADE)
 def test_errors_are_as_large_as_their_covariance_says(frame):
     nees = []
