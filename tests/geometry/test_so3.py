@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.geometry import so3
@@ -22,8 +23,8 @@ AXES = np.array(
 )
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 
-at_every_angle = pytest.mark.parametrize("angle", ANGLES)
-below_pi = pytest.mark.parametrize("angle", BELOW_PI)
+at_every_angle = each("angle", ANGLES)
+below_pi = each("angle", BELOW_PI)
 
 
 def vectors(angle: float) -> np.ndarray:
@@ -58,7 +59,7 @@ def test_hat_is_the_cross_product() -> None:
     np.testing.assert_allclose(so3.hat_many(many) @ w, np.cross(many, w), rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 2 * pi, 10.0])
+@each("angle", [*ANGLES, 4.0, 2 * pi, 10.0])
 def test_exp(angle: float) -> None:
     for phi in vectors(angle):
         R = so3.exp(phi)
@@ -119,7 +120,7 @@ def test_right_jacobian(angle: float) -> None:
         )
 
 
-@pytest.mark.parametrize("angle", [angle for angle in ANGLES if angle <= pi - 1e-3])
+@each("angle", [angle for angle in ANGLES if angle <= pi - 1e-3])
 def test_inverse_jacobians_are_derivatives_of_the_log(angle: float) -> None:
     for phi in vectors(angle):
         R = so3.exp(phi)
@@ -148,9 +149,7 @@ def test_laws(angle: float) -> None:
         np.testing.assert_allclose(R, np.eye(3) + so3.hat(phi) @ left, atol=4e-15)
 
 
-@pytest.mark.parametrize(
-    "x", [0.0, 1e-300, 1e-12, 1e-6, 1e-3, np.nextafter(0.01, 0), 0.01, np.nextafter(0.01, 1), 1.0, pi**2]
-)
+@each("x", [0.0, 1e-300, 1e-12, 1e-6, 1e-3, np.nextafter(0.01, 0), 0.01, np.nextafter(0.01, 1), 1.0, pi**2])
 def test_coefficients_keep_their_digits(x: float) -> None:
     for k, found in enumerate(so3.jacobian_coefficients(x)):
         expected = term = 1 / np.prod(np.arange(1, k + 2, dtype=np.longdouble))

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import CalibrationError, RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Tag, Target
@@ -55,7 +56,7 @@ SCENE = Scene(("grid", "tags"), (GRID, TAGS))
 AMBIGUOUS = Scene(("grid", "tags", "board"), (GRID, TAGS, BOARD))
 
 
-@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS, SCENE], ids=lambda t: t.type)
+@each("target", [GRID, CHARUCO, BOARD, TAG, TAGS, SCENE])
 def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Target):
     index = np.arange(len(target.points))
     np.testing.assert_array_equal(target.point_index(*target.point_identity(index)), index)
@@ -65,8 +66,8 @@ def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Ta
     assert (target.tag_centers != target.points).any() == target.blooms
 
 
-@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS], ids=lambda t: t.type)
-@pytest.mark.parametrize("rows", [5, 7])
+@each("target", [GRID, CHARUCO, BOARD, TAG, TAGS])
+@each("rows", [5, 7])
 def test_corners_of_a_tag_have_its_number_alone_and_in_a_scene(target: Target, rows: int):
     tag, _ = target.point_identity(np.arange(len(target.points)))
     expected = tag if target.type in ("aprilgrid", "tag", "markers") else np.arange(len(tag))
@@ -127,7 +128,7 @@ def test_tag_corners_run_counterclockwise_from_the_bottom_left():
     np.testing.assert_allclose(TAG.tag_centers, [[0.1, 0.1, 0.0]] * 4)
 
 
-@pytest.mark.parametrize(
+@each(
     ("target", "tag_id", "corner", "words"),
     [
         (CHARUCO, 0, 24, "corner 24 is not on the target (corners 0 to 23); check squares_x and squares_y"),
@@ -147,7 +148,7 @@ def test_points_that_a_target_lacks(target: Target, tag_id: int, corner: int, wo
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "words"),
     [
         (lambda: Charuco(7, 5, 0.04, 0.04, "5x5_100"), "marker_size 0.04 does not fit a square of 0.04"),
@@ -176,7 +177,7 @@ def test_families_are_opencvs():
         assert tag_bits(family, count - 1).shape == (bits, bits)
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "name"),
     [
         ("tag36h11", "tag36h11"),
@@ -198,7 +199,7 @@ def test_spellings_of_one_family(text: str, name: str):
     assert Charuco(3, 3, 0.04, 0.03, text).dictionary == name
 
 
-@pytest.mark.parametrize("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
+@each("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
 def test_families_that_there_are_not(text: str):
     with pytest.raises(RigError, match=f"no tag family '{text}'.*; available are 4x4_50, .*tag36h11"):
         family_name(text)

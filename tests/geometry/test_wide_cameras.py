@@ -6,6 +6,7 @@ from math import sqrt
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 
@@ -67,7 +68,7 @@ def test_the_ranges_are_those_of_the_papers() -> None:
         np.testing.assert_array_equal(found, points[:, 2] > -min(mirror, 1.0 / mirror) * d)
 
 
-@pytest.mark.parametrize("name", CAMERA_MODELS)
+@each("name", CAMERA_MODELS)
 def test_any_parameters_are_finite_and_no_crash(name: str) -> None:
     """Far outside the domain too: what an estimate may try on its way."""
     model, rng = camera_model(name), np.random.default_rng(2)
