@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a case t
 def each(names: str | tuple[str, ...], cases: Iterable[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Like `pytest.mark.parametrize`, but one item: thousands of them take longer to collect than to run.
 
-    For functions of values: fixtures such as `tmp_path` and `monkeypatch` are shared by all cases.
+    Each case has a folder `tmp_path` of its own, and ends with its patches; all other fixtures are shared.
     """
     keys = tuple(names.split(", ")) if isinstance(names, str) else names
     listed = [_named(case, keys) for case in cases]
@@ -25,9 +26,10 @@ def each(names: str | tuple[str, ...], cases: Iterable[Any]) -> Callable[[Callab
         @functools.wraps(test)
         def run(*instance: Any, **fixtures: Any) -> None:
             failed = []
-            for label, values in listed:
+            for number, (label, values) in enumerate(listed):
                 try:
-                    test(*instance, **values, **fixtures)
+                    with _own(fixtures, number) as own:
+                        test(*instance, **values, **own)
                 except FAILURES as error:
                     failed.append((label, error))
             if failed:
@@ -50,3 +52,16 @@ def _named(case: Any, keys: tuple[str, ...]) -> tuple[str, dict[str, Any]]:
         label, values = case.id, case.values
     label = label or ", ".join(f"{getattr(value, '__name__', value)!s:.60}" for value in values)
     return label, dict(zip(keys, values, strict=True))
+
+
+@contextmanager
+def _own(fixtures: dict[str, Any], number: int) -> Iterator[dict[str, Any]]:
+    """Fixtures of one case: an empty folder, nothing printed yet, and patches that end with it."""
+    own = dict(fixtures)
+    if "tmp_path" in own:
+        own["tmp_path"] = own["tmp_path"] / f"case{number}"
+        own["tmp_path"].mkdir()
+    if "capsys" in own:
+        own["capsys"].readouterr()
+    with pytest.MonkeyPatch.context() as patch:
+        yield own | ({"monkeypatch": patch} if "monkeypatch" in own else {})

@@ -43,3 +43,15 @@ def test_no_case_or_one_of_other_length_is_an_error():
     for names, cases in (("a", []), ("a, b", [(1, 2, 3)])):
         with pytest.raises((AssertionError, ValueError)):
             each(names, cases)
+
+
+def test_each_case_has_its_own_folder_patches_and_output(tmp_path, monkeypatch, capsys):
+    @each("a", [1, 2])
+    def check(a: int, tmp_path, monkeypatch, capsys):
+        assert not hasattr(each, "patched") and not list(tmp_path.iterdir()) and not capsys.readouterr().out
+        monkeypatch.setattr(each, "patched", a, raising=False)
+        (tmp_path / "file").touch()
+        print(a)
+
+    check(tmp_path=tmp_path, monkeypatch=monkeypatch, capsys=capsys)
+    assert not hasattr(each, "patched")

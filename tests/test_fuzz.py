@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import yaml
+from tests.cases import each
 
 from icalib import cli
 
@@ -34,7 +35,7 @@ def test_some_cases():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-@pytest.mark.parametrize(
+@each(
     ("said", "content", "fault"),
     [
         ("icalib: a.yaml:1: must be a mapping, but is 'nan nan nan ...'.\n", b"nan\nnan\nnan\nnan\n", False),

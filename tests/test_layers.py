@@ -10,7 +10,7 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
+from tests.cases import each
 
 import icalib
 from icalib.sensors import FACETS, SENSOR_KINDS
@@ -168,7 +168,7 @@ def modules() -> list[tuple[str, str, Path]]:
     return found
 
 
-@pytest.mark.parametrize(("module", "package", "file"), modules(), ids=lambda value: value if value else None)
+@each(("module", "package", "file"), modules())
 def test_module_imports_only_from_lower_levels(module: str, package: str, file: Path):
     assert level_of(folder_of(module)) is not None, (
         f"{module} has no level; give its folder one in tests/test_layers.py"
@@ -176,7 +176,7 @@ def test_module_imports_only_from_lower_levels(module: str, package: str, file: 
     assert violations(file.read_text(encoding="utf-8"), module, package) == []
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "module", "forbidden"),
     [
         ("from icalib.pipeline import calibrate", "icalib.rig.rig", ["pipeline"]),

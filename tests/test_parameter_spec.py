@@ -11,6 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
@@ -80,7 +81,7 @@ def test_no_table_lists_parameters_a_second_time():
     assert {path: listed for path, listed in found.items() if listed} == {}
 
 
-@pytest.mark.parametrize("kind", SENSOR_TYPES.values(), ids=SENSOR_TYPES)
+@each("kind", SENSOR_TYPES.values())
 def test_the_parameters_of_a_sensor_are_its_fields(kind: type[Sensor]):
     fields = {f.name for f in dataclasses.fields(kind) if f.type == "Parameter"}
     assert {spec.name for spec in kind.stated()} == fields
@@ -94,7 +95,7 @@ def test_kinds_that_share_a_name_share_its_definition():
     assert all(kind.sensor_type == name and kind.noun for name, kind in SENSOR_TYPES.items())
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.name)
+@each("sensor", SENSORS)
 def test_every_parameter_has_its_labels_and_a_tolerance(sensor: Sensor):
     for spec in sensor.specs():
         assert len(set(spec.labels)) == spec.size and spec.prior_sigma > 0.0
@@ -109,7 +110,7 @@ def drawn(spec: ParameterSpec) -> Parameter:
     return Parameter("prior", value, 0.01 + 0.1 * np.arange(spec.size))
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.name)
+@each("sensor", SENSORS)
 def test_every_parameter_goes_through_the_rig_file(sensor: Sensor):
     stated = [spec for spec in sensor.specs() if spec.name in {own.name for own in sensor.stated()}]
     sensor = dataclasses.replace(sensor, **{spec.name: drawn(spec) for spec in stated})

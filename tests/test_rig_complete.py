@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import Measurements
 from icalib.errors import RigError
@@ -20,7 +21,7 @@ MOCAP, ODOMETRY = PoseSensor("mocap0", ""), PoseSensor("odom0", "", "relative")
 EMPTY = Measurements.of_streams()
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "sentence"),
     [
         (Rig(by_name(IMU)), "there is no camera, no LiDAR, no pose sensor and no position sensor"),
@@ -43,7 +44,6 @@ EMPTY = Measurements.of_streams()
         (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
         (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
     ],
-    ids=lambda value: "" if isinstance(value, Rig) else value,
 )
 def test_what_cannot_be_calibrated_is_refused(rig: Rig, sentence: str):
     with pytest.raises(RigError, match=sentence):

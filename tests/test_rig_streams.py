@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import (
     CornerStream,
@@ -58,7 +59,7 @@ def test_streams_come_in_the_order_of_the_rig():
     assert (found.imu, found.wheels, found.poses) == (WHOLE.imu, WHOLE.wheels, WHOLE.poses)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "measured", "words"),
     [
         (RIG, WHOLE.without("imu0"), "drive has no data of imu0"),

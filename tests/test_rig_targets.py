@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
@@ -32,7 +33,7 @@ def written(tmp_path: Path):
     return write
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "target"),
     [
         (f"target: {TAGS}", MARKERS),
@@ -78,7 +79,7 @@ LARGER = CHARUCO.replace("5x5_100", "5x5_1000")
 ONE_BIT = GRID.replace("}", ", border_bits: 1}")
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [
         ("", "rig.yaml:1: target is missing; add target, targets for several by name, or tracks"),

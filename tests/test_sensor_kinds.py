@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import pytest
+from tests.cases import each
 
 import icalib
 from icalib.sensors import SENSOR_KINDS
@@ -88,7 +88,7 @@ def test_no_module_outside_of_the_folders_of_sensors_names_a_kind():
     assert set(found) >= NAMING, "take modules that name no kind any more off the list"
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "named"),
     [
         ("from icalib.rig import Lidar, Rig", {"Lidar"}),

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.base.extras import load_lz4, load_zstd
 from icalib.base.input_files import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
@@ -64,7 +65,7 @@ def archive(name: str, header: str, data: bytes = b"") -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize(
+@each(
     "header",
     [
         "{'descr': '<f8', 'fortran_order': False, 'shape': (137438953472,)}",

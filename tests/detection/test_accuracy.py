@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.detection import AprilGridDetector, CharucoDetector, CheckerboardDetector, MarkerDetector
 
@@ -70,9 +71,9 @@ IMAGES = 2
 CROWDED_SIGMA_PX = 0.035  # of corners so near to the bits of their tag that these may move them
 
 
-@pytest.mark.parametrize("pose", POSES)
-@pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.parametrize("blur", [0.7, 1.2])
+@each("pose", POSES)
+@each("target", TARGETS)
+@each("blur", [0.7, 1.2])
 def test_corners_are_right(rendering, target, pose, blur):
     (kind, *arguments), detector, y_up, least = TARGETS[target]
     pattern = getattr(rendering, kind)(*arguments)
@@ -99,10 +100,8 @@ def test_corners_are_right(rendering, target, pose, blur):
         assert np.abs(uv.mean(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("family", "side"), [("APRILTAG_36H11", 18), ("APRILTAG_36H11", 20), ("4X4_50", 14), ("4X4_50", 17)]
-)
-@pytest.mark.parametrize("blur", [0.6, 0.8])
+@each(("family", "side"), [("APRILTAG_36H11", 18), ("APRILTAG_36H11", 20), ("4X4_50", 14), ("4X4_50", 17)])
+@each("blur", [0.6, 0.8])
 def test_small_tags_are_kept_with_a_sigma_that_is_right(rendering, family, side, blur):
     """Sides [px] for which the bits are too near to the edges: their errors are larger, and so is their sigma."""
     ids = (1, 5, 9)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.detection import CheckerboardDetector
 from icalib.detection.boards import checkerboard as module
@@ -25,7 +26,7 @@ def board(rendering):
     return rendering.render(pattern, H), rendering.applied(H, pattern.points)
 
 
-@pytest.mark.parametrize(("rows", "cols"), [(5, 9), (6, 8), (5, 8), (7, 10), (9, 9), (3, 4)])
+@each(("rows", "cols"), [(5, 9), (6, 8), (5, 8), (7, 10), (9, 9), (3, 4)])
 def test_a_board_of_another_size_is_not_found(board, rows, cols):
     assert not len(CheckerboardDetector(rows, cols).detect(board[0]).point)
 

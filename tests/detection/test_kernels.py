@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
+from tests.cases import each
 
 from icalib.detection.primitives.decoding import (
     bilinear,
@@ -185,8 +186,8 @@ FINE_V, FINE_U = (np.indices((480, 480)) + 0.5) / 8.0 - 0.5
 CURVATURES = [(0.004, 0.0), (0.0, -0.004), (-0.003, 0.005)]  # 1 / px: of a lens that bends much
 
 
-@pytest.mark.parametrize("curvature", CURVATURES)
-@pytest.mark.parametrize("turned", [False, True])
+@each("curvature", CURVATURES)
+@each("turned", [False, True])
 def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, turned):
     ea, eb, corner = np.array([30.0, 6.0]), np.array([-4.0, 28.0]), np.array([30.3, 29.6])
     la = bent_distance(FINE_U, FINE_V, corner, ea, curvature[0])
@@ -206,8 +207,8 @@ def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, t
         np.testing.assert_array_equal(edge[:2], -edge[2:4])
 
 
-@pytest.mark.parametrize("curvature", CURVATURES)
-@pytest.mark.parametrize("length", [18.0, 36.0])
+@each("curvature", CURVATURES)
+@each("length", [18.0, 36.0])
 def test_corners_of_a_quad_move_to_their_places_where_curvatures_are_known(curvature, length):
     """Short sides are fitted as straight ones, long ones with a bend, and noise makes the fitted bend another one."""
     quad = 30.0 + length * (np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5) + 0.2
@@ -261,8 +262,8 @@ def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
     np.testing.assert_array_equal(np.flatnonzero(~consistent_corners(uv, xy, found, side, (480, 752))), [row])
 
 
-@pytest.mark.parametrize("focal", [120.0, 200.0, 320.0])
-@pytest.mark.parametrize("row", [0, 14, 77])
+@each("focal", [120.0, 200.0, 320.0])
+@each("row", [0, 14, 77])
 def test_a_fisheye_bends_a_board_without_making_corners_inconsistent(focal, row):
     """An equidistant lens that sees the board from near, to 83 degrees from its axis."""
     xy = np.stack(np.meshgrid(np.arange(11.0), np.arange(7.0)), axis=-1).reshape(-1, 2)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.detection import what_is_seen
 from icalib.detection.boards.detectors import detector_of
@@ -115,7 +116,7 @@ def test_the_wrong_layout_is_named(legacy):
     assert with_other_layout([image], replace(board, squares_y=7)) == ""  # the layouts are one
 
 
-@pytest.mark.parametrize(
+@each(
     ("board", "wrong", "words"),
     [
         (

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.detection.boards.detectors import _Detector, _Follower, detector_of
@@ -109,8 +110,8 @@ def test_a_target_that_jumped_is_searched_for(name):
         np.testing.assert_array_equal(a.uv, b.uv)
 
 
-@pytest.mark.parametrize("name", ["charuco", "checkerboard"])
-@pytest.mark.parametrize("squares", [(2, 0), (0, 2), (1, 1)])
+@each("name", ["charuco", "checkerboard"])
+@each("squares", [(2, 0), (0, 2), (1, 1)])
 def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
     """Where it is expected, its squares look right."""
     detector, (image,) = detector_of(TARGETS[name]), filmed(TARGETS[name], 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.detection.boards.detectors import detector_of
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
@@ -22,8 +22,8 @@ TARGETS: dict[str, tuple[Target, float, float]] = {  # distance of the camera [m
 }
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("name", TARGETS)
+@each("camera", CAMERAS)
+@each("name", TARGETS)
 def test_corners_of_a_board_seen_from_near_are_kept(camera, name):
     target, distance, least = TARGETS[name]
     a, low, high = np.radians(15.0), target.points.min(axis=0), target.points.max(axis=0)

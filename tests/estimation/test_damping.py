@@ -6,13 +6,14 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from tests.cases import each
 
 from icalib.estimate.problem.damping import CAREFUL_DAMPING, Damping
 from icalib.estimate.problem.descent import Descent
 from icalib.estimate.problem.outcome import Step
 
 
-@pytest.mark.parametrize(
+@each(
     ("promised", "accepted", "creeps"),
     [((8.0, 6.0), (True, True), True), ((20.0, 12.0), (True, True), False), ((8.0, 6.0), (True, False), False)],
 )

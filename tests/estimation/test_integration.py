@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
@@ -125,9 +126,9 @@ SPANS = {
 }
 
 
-@pytest.mark.parametrize("intrinsics", [None, INTRINSICS], ids=["ideal", "intrinsics"])
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("span", SPANS)
+@each("intrinsics", [None, INTRINSICS])
+@each("backwards", [False, True])
+@each("span", SPANS)
 def test_increments_are_products_of_matrix_exponentials(span, backwards, intrinsics):
     """Steps of 2 to 11 ms, whose rates change by up to 3 rad/s. Second-order terms, here 2e-4 m/s, are those of
     readings as recorded, and the intrinsics are errors of 2 %."""
@@ -139,8 +140,8 @@ def test_increments_are_products_of_matrix_exponentials(span, backwards, intrins
     assert_same(found, expected, 5e-6 if intrinsics is None else 3e-5)
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-@pytest.mark.parametrize("backwards", [False, True])
+@each("angle", ANGLES)
+@each("backwards", [False, True])
 def test_one_step_at_every_angle_with_unit_force(angle, backwards):
     r = Irregular.constant(np.array([0.0, 1.0]), angle * UNIT, UNIT[[1, 2, 0]])
     t0, t1 = (1.0, 0.0) if backwards else (0.0, 1.0)
@@ -200,8 +201,8 @@ def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
-@pytest.mark.parametrize("order", ["of keyframes", "of time", "any"])
-@pytest.mark.parametrize("width", [0, 6, 30])
+@each("order", ["of keyframes", "of time", "any"])
+@each("width", [0, 6, 30])
 def test_what_is_carried_on_is_what_starts_anew(order, width):
     """Bit by bit, whatever the order; instants lie on stamps and keyframes, between, and beyond both ends."""
     rng = np.random.default_rng(3)
@@ -240,9 +241,9 @@ def test_rate_and_force_at_the_end_are_those_of_the_signal(backwards):
     np.testing.assert_allclose(force, f, atol=1e-13)
 
 
-@pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("span", ["between stamps", "stamp to stamp", "within one interval", "whole"])
+@each("intrinsics", [np.zeros(24), INTRINSICS])
+@each("backwards", [False, True])
+@each("span", ["between stamps", "stamp to stamp", "within one interval", "whole"])
 def test_jacobians_by_central_differences(span, backwards, intrinsics):
     t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
     R, _, _, J, _, _ = run(R0, t0, t1, intrinsics=intrinsics, width=30)
@@ -254,7 +255,7 @@ def test_jacobians_by_central_differences(span, backwards, intrinsics):
         np.testing.assert_allclose(J[:, n], difference(plus, minus, R, h), rtol=1e-7, atol=1e-9, err_msg=str(n))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
+@each("angle", ANGLES)
 def test_bias_jacobian_of_one_step_at_every_angle(angle):
     r = Irregular.constant(np.array([0.0, 1.0]), angle * UNIT, UNIT[[1, 2, 0]])
     zero, h = np.zeros(6), 1e-5

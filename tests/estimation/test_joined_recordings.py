@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.data.joining import PAUSE_NS, join
@@ -187,7 +188,7 @@ def test_a_state_knows_its_recordings():
     assert state.recordings == [slice(0, 3), slice(3, 5), slice(5, 7)]
 
 
-@pytest.mark.parametrize(
+@each(
     ("starts", "n", "segments", "expected"),
     [
         ((0,), 101, 4, [0, 25, 50, 75, 100]),

@@ -141,6 +141,7 @@ def test_a_start_that_predicts_nothing_finite_is_an_error(noisy_problem):
         minimise(problem, bad)
 
 
+@pytest.mark.full
 def test_slow_motion_and_a_poor_imu_converge_although_gravity_is_hardly_known():
     """The tilt of the board then moves by degrees, and with it, in one step, accelerometer bias and lever arm."""
     scenario = handheld(20.0, imu="noisy")

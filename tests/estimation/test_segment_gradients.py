@@ -101,7 +101,7 @@ def test_gradients_are_slopes_of_the_cost_of_each_segment(case, request, dense):
         assert slope == pytest.approx(parts.gradients[g] @ direction, rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_gradients_scatter_as_expected_of_white_noise(setup_of, problem_of):
     """Over 20 recordings; the mean ratio has a standard error of 5 %. Trajectories that follow the noise at the ends of
     segments take about 5 % of the scatter."""

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream
 from icalib.errors import EstimationError
@@ -24,7 +25,7 @@ def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:
     return LidarStream(stream.name, stream.stamps_ns, start, stream.offset_s[own], stream.xyz[own], stream.plane[own])
 
 
-@pytest.mark.parametrize(
+@each(
     ("faces", "count"),
     [([0], 1), ([3], 1), ([0, 1], 1), ([2, 3], 1), ([0, 2], 2), ([0, 4, 5], 2), ([2, 4], 2), ([0, 2, 4], 3), ([], 0)],
 )

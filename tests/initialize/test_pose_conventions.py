@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
@@ -91,7 +92,7 @@ def state_of(sim) -> State:
     return State(keyframes, R, p, v, np.tile(bias, (len(keyframes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
 
 
-@pytest.mark.parametrize(("way", "words"), WRONG)
+@each(("way", "words"), WRONG)
 def test_written_another_way(sim, way, words):
     written = sim.measurements.with_streams(*(way(x) for x in sim.measurements.poses))
     inputs = inputs_for(rig_for(sim.scenario), [written])

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.sensors.lidar.initialize import self_returns
@@ -42,8 +43,8 @@ PANELS = {
 }
 
 
-@pytest.mark.parametrize("panel", PANELS.values(), ids=list(PANELS))
-@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+@each("panel", PANELS.values())
+@each("example", ["table2-3d", "table2-planar", "table2-ramp"])
 def test_points_on_the_robot_are_found(robot, example, panel):
     stream, hit = with_panel(robot(16.0, 1, {"azimuth_steps": 300}, example=example).streams[0], *panel)
     own = self_returns_of(stream)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
@@ -82,7 +83,7 @@ def off_px(simulation: Simulation, lens: np.ndarray) -> float:
     return float(np.sqrt(((model.project(true, turned)[0] - uv) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@each("lens", LENSES)
 def test_every_model_is_found(lens: str):
     """To 3 mrad: half a pixel of a fisheye lens, two of a long one."""
     simulation = drive(lens)

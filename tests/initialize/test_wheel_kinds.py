@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
@@ -48,7 +49,7 @@ def test_steered_wheels_are_exact_without_noise():
     np.testing.assert_allclose(got, [RADIUS, BASE, OFFSET], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "values", "words"),
     [
         ("twist", TWIST * [3.6, 1.0] * SCALES, "its forward speed must be in m/s, not km/h"),

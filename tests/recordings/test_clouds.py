@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream
 from icalib.data.recordings import BagRecording
@@ -143,7 +144,7 @@ DRIVERS = {
 }
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
+@each("driver", DRIVERS)
 def test_points_are_timed_as_drivers_write_it(write, read, driver):
     dtype, times, stamp_at, fields, within_ns = DRIVERS[driver]
     found = scans()
@@ -162,8 +163,8 @@ def test_points_on_a_clock_of_their_own(write, read):
     assert len(notes) == 1 and "the point times `timestamp` are from another clock than the message stamps" in notes[0]
 
 
-@pytest.mark.parametrize("direction", [1, -1])
-@pytest.mark.parametrize("order", ["columns", "rows", "organised"])
+@each("direction", [1, -1])
+@each("order", ["columns", "rows", "organised"])
 def test_points_are_timed_by_azimuth(write, read, direction, order):
     """Within the firing of a column; the second message begins with a hole of a quarter of a turn."""
     found = scans(direction)
@@ -265,7 +266,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each("case", REFUSED)
 def test_what_would_be_wrong_is_refused(write, read, case):
     build, fields, words = REFUSED[case]
     with pytest.raises(RecordingError) as error:
@@ -287,8 +288,8 @@ OTHER_UNITS = {
 }
 
 
-@pytest.mark.parametrize("case", OTHER_UNITS)
-@pytest.mark.parametrize("given", [False, True])
+@each("case", OTHER_UNITS)
+@each("given", [False, True])
 def test_the_unit_is_the_one_that_fits(write, read, case, given):
     """How long scans take leaves one unit, which a note names; the rig file may say it."""
     dtype, times, words, unit, within_ns = OTHER_UNITS[case]
@@ -407,8 +408,8 @@ BAD_TIMES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_TIMES)
-@pytest.mark.parametrize("every", [1, 3, 100])
+@each("case", BAD_TIMES)
+@each("every", [1, 3, 100])
 def test_single_bad_times_are_left_out(write, read, case, every):
     """In one scan of three, or in all: one point in a hundred."""
     dtype, times, field, bad = BAD_TIMES[case]
@@ -496,7 +497,7 @@ def test_empty_clouds(write, read):
         read(messages)
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"offset": 2**31 - 1},
@@ -522,7 +523,7 @@ def test_fields_that_lie_beyond_a_point(write, read, wrong):
         read([(t, dataclasses.replace(m, fields=messages[3][1].fields)) for t, m in messages])
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"width": 2**32 - 1},

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import CornerStream, TrackStream
 from icalib.sensors.camera.read.even_images import with_even_stamps
@@ -40,8 +41,8 @@ def evened(*streams: CornerStream | TrackStream) -> tuple[list[CornerStream | Tr
     return [s for s, _ in found], tuple(note for _, notes in found for note in notes)
 
 
-@pytest.mark.parametrize("size_ms", [0.2, 1.0, 3.0])
-@pytest.mark.parametrize("delay", ["normal", "exponential", "dropped frames"])
+@each("size_ms", [0.2, 1.0, 3.0])
+@each("delay", ["normal", "exponential", "dropped frames"])
 def test_jitter(even, delay, size_ms):
     """A line through symmetric delays is off by 2 sigma / sqrt(n) at its ends; the envelope of one-sided ones less."""
     rng = np.random.default_rng(2)

@@ -7,6 +7,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.images.images import file_payload, file_size
 from icalib.data.recordings import DamagedImageError, Payload, decode
@@ -35,8 +36,8 @@ def test_grey_is_itself(encoding, padding):
     np.testing.assert_array_equal(image, GREY)
 
 
-@pytest.mark.parametrize("padding", [0, 5])
-@pytest.mark.parametrize(
+@each("padding", [0, 5])
+@each(
     ("encoding", "channels"),
     [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])],
 )
@@ -45,9 +46,9 @@ def test_colour_is_luma(encoding, channels, padding):
     np.testing.assert_allclose(image, LUMA, atol=1.0)
 
 
-@pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("padding", [0, 4])
-@pytest.mark.parametrize(("darkest", "brightest"), [(0, 200), (0, 1023), (0, 65535), (29_000, 29_300)])
+@each("big_endian", [False, True])
+@each("padding", [0, 4])
+@each(("darkest", "brightest"), [(0, 200), (0, 1023), (0, 65535), (29_000, 29_300)])
 def test_sixteen_bits_are_stretched(darkest, brightest, padding, big_endian):
     pixels = RNG.integers(darkest, brightest + 1, (H, W)).astype(np.uint16)
     pixels[2, 3], pixels[0, 1] = brightest, darkest

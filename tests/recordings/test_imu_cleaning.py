@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.data.stamps.even import EvenStamps, even_stamps, followed
@@ -51,8 +52,8 @@ def test_the_note_names_time_and_count(waved):
     assert f"the first 3.500 s from the start, at {waved.stamps_ns[700]} ns" in notes[0]
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("size", [8.0, 20.0, 1e3, 1e28])
+@each("seed", range(4))
+@each("size", [8.0, 20.0, 1e3, 1e28])
 def test_one_reading_of_a_hundred_is_wrong(waved, seed, size):
     """Those next to each other, too; and none but these is left out."""
     rng = np.random.default_rng(seed)
@@ -105,8 +106,8 @@ def test_a_sensor_that_is_stuck_for_a_while(waved):
     assert np.flatnonzero(~is_left(found, waved)).tolist() == list(range(500, 530)), notes
 
 
-@pytest.mark.parametrize("shift_ns", [-3_000_000, -8_000_000, 2_000_000, 12_000_000])
-@pytest.mark.parametrize("share", [0.02, 0.25, 0.5])
+@each("shift_ns", [-3_000_000, -8_000_000, 2_000_000, 12_000_000])
+@each("share", [0.02, 0.25, 0.5])
 def test_copies_under_other_stamps(waved, shift_ns, share):
     """As a T265 sends them; the originals are told by their even stamps."""
     again = np.random.default_rng(0).random(len(waved.gyro)) < share
@@ -146,8 +147,8 @@ class TestEvenStamps:
             imu.stamps_ns, lambda number, delay: followed(number, delay, np.zeros(n), np.arange(n), values)
         )
 
-    @pytest.mark.parametrize("burst", [2, 5, 10, 32])
-    @pytest.mark.parametrize("within_ns", [0, 1000, 100_000])
+    @each("burst", [2, 5, 10, 32])
+    @each("within_ns", [0, 1000, 100_000])
     def test_bursts(self, waved, burst, within_ns):
         """Each stamp is that of its burst's last reading, and so many ns more; the sampling clock comes back."""
         k = np.arange(len(waved.gyro))

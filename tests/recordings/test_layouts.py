@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.recordings import FolderRecording, read_measurements
@@ -177,7 +178,7 @@ def test_bursts_and_jumps_do_not_change_the_unit():
     assert unit_of_stamps(jumped / 1000, 10.0, 20_000.0) == "us"
 
 
-@pytest.mark.parametrize(
+@each(
     ("step", "count", "rate_hz", "unit"),
     [
         (33, 900, (1e-3, 1000.0), "ms"),  # 30 s at 30 Hz, and not eight hours

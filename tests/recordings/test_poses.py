@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import PoseStream
 from icalib.data.recordings import BagRecording, FolderRecording, open_recording, read_measurements
@@ -188,9 +189,9 @@ LOST = {
 }
 
 
-@pytest.mark.parametrize("case", LOST)
-@pytest.mark.parametrize("sensor", [ABSOLUTE, RELATIVE], ids=["absolute", "relative"])
-@pytest.mark.parametrize("far", [[0.0, 0.0, 0.0], [465_000.0, 5_248_000.0, 413.0]], ids=["near", "far"])
+@each("case", LOST)
+@each("sensor", [ABSOLUTE, RELATIVE])
+@each("far", [[0.0, 0.0, 0.0], [465_000.0, 5_248_000.0, 413.0]])
 def test_lost_poses_are_left_out(case, sensor, far):
     """A tracker that is lost reports the origin, or no position and no rotation at all."""
     lost, rng = LOST[case], np.random.default_rng(0)

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelStream
@@ -315,9 +316,9 @@ def test_joints_one_at_a_time(bag_of):
         wheel_readings(bag, Wheels("wheel0", ""))
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300])
-@pytest.mark.parametrize("measures", ["rates", "angles"])
-@pytest.mark.parametrize("column", [0, 1])
+@each("bad", [np.nan, np.inf, -np.inf, 1e300])
+@each("measures", ["rates", "angles"])
+@each("column", [0, 1])
 def test_single_messages_with_one_joint_that_is_none(bag_of, measures, column, bad):
     def content(k: int) -> tuple[list[str], list[float], list[float]]:
         value = (RATES if measures == "rates" else ANGLES)[k].copy()

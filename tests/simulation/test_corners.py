@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.tools.simulation import SimCamera, handheld, simulate
@@ -103,7 +104,7 @@ def test_recordings_of_wide_lenses_are_exact_too(lens):
     np.testing.assert_allclose(sim.measurements.cameras[0].uv, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [handheld().cameras[0], RATIONAL, *WIDE], ids=lambda c: c.model)
+@each("camera", [handheld().cameras[0], RATIONAL, *WIDE])
 def test_projection_and_its_directional_derivative(camera):
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-1.0, 1.0, (50, 2)), rng.uniform(0.4, 2.0, (50, 1))], axis=1)

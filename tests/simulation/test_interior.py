@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.tools.simulation import (
@@ -94,7 +95,7 @@ def eye_before(room: Room, face: int, spot: np.ndarray, rng: np.random.Generator
             return eye
 
 
-@pytest.mark.parametrize("camera", DISTORTED, ids=lambda c: c.model)
+@each("camera", DISTORTED)
 def test_marks_of_the_texture_are_where_their_surface_is(camera: SimCamera):
     """A spot on each face of a dark room, seen from all sides: its centroid, by the simulator's own projection."""
     room, sigma, rng = Room(SIZE, BLOCKS), 0.016, np.random.default_rng(5)

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.rig.kinds import SENSOR_TYPES
 from icalib.sensors.camera.spec import Camera
@@ -41,7 +42,7 @@ def test_a_kind_declares_what_its_sensors_have(kind: str):
     assert all(hasattr(sensor, field) for field in simulated.effects.values())
 
 
-@pytest.mark.parametrize("kind", SENSOR_TYPES)
+@each("kind", SENSOR_TYPES)
 def test_names_of_topics_are_no_names_of_sensors(kind: str):
     inspector = inspectors()[kind]
     assert not re.fullmatch(inspector.plain_names, f"{inspector.prefix}0")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import RigError
@@ -136,7 +137,7 @@ def test_every_field_arrives(tmp_path):
     np.testing.assert_allclose(s.T_world_board, T, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", sorted(PAPER.glob("*.yaml")), ids=lambda path: path.stem)
+@each("path", sorted(PAPER.glob("*.yaml")))
 def test_shipped_scenarios_load_and_run(path):
     scenario = load_scenario(path)
     lidars = tuple(replace(s, azimuth_steps=36) for s in scenario.of(SimLidar))
