@@ -99,9 +99,10 @@ def by_expm(r, t0, t1, bias=BIAS, intrinsics=None, parts=60):
     stops = [t0, *sorted(inner, reverse=bool(t1 < t0)), t1]
     X = np.eye(5)
     for a, b in zip(stops[:-1], stops[1:], strict=True):
-        for k in range(parts):
-            rate, force = corrected_at(r, a + (k + 0.5) * (b - a) / parts, bias, intrinsics)
-            X = X @ expm(generator(rate, force) * (b - a) / parts)
+        x = np.array([r.at(a + (k + 0.5) * (b - a) / parts) for k in range(parts)])
+        rates, forces = corrected(x[:, :3], x[:, 3:], bias, intrinsics)
+        for step in expm(np.stack([generator(w, f) for w, f in zip(rates, forces, strict=True)]) * (b - a) / parts):
+            X = X @ step
     return X[:3, :3], X[:3, 3], X[:3, 4]
 
 
