@@ -74,7 +74,7 @@ def test_a_tag_that_is_hidden_is_left_out(rendering):
     assert set(range(36)) - set(found.point[found.kept] // 4) == {14}
 
 
-@pytest.mark.parametrize(
+@each(
     "detector",
     [
         AprilGridDetector(6, 6, 0.3),

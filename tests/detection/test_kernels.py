@@ -74,7 +74,7 @@ def test_read_cells_packs_row_by_row_and_counts_a_white_border():
     assert visible_cells(grey, 1) == 0b0111
 
 
-@pytest.mark.parametrize("side", [20.0, 30.0, 50.0])
+@each("side", [20.0, 30.0, 50.0])
 def test_fit_step_is_the_least_squares_fit(side):
     normal = np.array([np.sin(0.3), -np.cos(0.3)])  # outward, for a side that runs along (cos, sin)
     along = np.array([np.cos(0.3), np.sin(0.3)])
@@ -253,7 +253,7 @@ def grid(noise=0.05):
     return xy, uv + noise * np.random.default_rng(5).standard_normal(uv.shape)
 
 
-@pytest.mark.parametrize("row", [0, 14, 35])
+@each("row", [0, 14, 35])
 def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
     xy, uv = grid()
     found, side = np.ones(36, dtype=bool), np.full(36, 30.0)
