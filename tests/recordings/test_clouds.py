@@ -358,7 +358,7 @@ def test_the_rig_file_names_the_field(write, read):
         read(messages, point_time_field="t")
 
 
-@pytest.mark.parametrize(
+@each(
     ("dtype", "times", "lines"),
     [
         (layout(20, laser_usec=("u4", 12)), lambda t, s: {"laser_usec": (t - s) // 1000}, ["laser_usec", "us"]),
@@ -451,7 +451,7 @@ def test_bytes_that_are_no_numbers(write, read):
         assert f"1 without numbers, {2 * SCANS} without a time within their scan were left out" in notes[0]
 
 
-@pytest.mark.parametrize("odd", [0, 1, 7, 11])
+@each("odd", [0, 1, 7, 11])
 def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
     make, found = write.maker(), scans()
     messages = packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
@@ -461,7 +461,7 @@ def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
     assert f"1 clouds lack fields of the others and were left out, the first at {found.stamps[odd]} ns" in notes[0]
 
 
-@pytest.mark.parametrize("point_time", ["auto", "azimuth", "snapshot"])
+@each("point_time", ["auto", "azimuth", "snapshot"])
 def test_clouds_that_are_all_stamped_alike(write, read, point_time):
     make, found = write.maker(), scans()
     still = Scans(np.full(SCANS, ORIGIN), found.since, found.xyz, found.ring)

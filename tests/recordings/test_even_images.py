@@ -66,7 +66,7 @@ def test_a_clock_that_drifts_stays(even):
     assert len(notes) == 1 and np.std(off) < 2e5
 
 
-@pytest.mark.parametrize("jitter_ms", [0.5, 2.0, 8.0])
+@each("jitter_ms", [0.5, 2.0, 8.0])
 def test_a_camera_that_is_exposed_unevenly_keeps_its_stamps(jitter_ms):
     stream = filmed(jitter_s=1e-3 * jitter_ms)
     (found,), notes = evened(stream)

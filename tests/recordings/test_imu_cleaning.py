@@ -33,8 +33,8 @@ def is_left(found: ImuStream, imu: ImuStream) -> np.ndarray:
     return np.isin(imu.stamps_ns, found.stamps_ns)
 
 
-@pytest.mark.parametrize("noiseless", [False, True])
-@pytest.mark.parametrize("seed", [2, 3])
+@each("noiseless", [False, True])
+@each("seed", [2, 3])
 def test_clean_readings_stay_bit_for_bit(seed, noiseless):
     imu = simulated(seed, noiseless=noiseless)
     found, notes = checked_imu(imu, "file")
@@ -69,7 +69,7 @@ def test_one_reading_of_a_hundred_is_wrong(waved, seed, size):
     assert left[~wrong].all() and not left[wrong][2:-2].any()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@each("value", [np.nan, np.inf, -np.inf])
 def test_readings_that_are_no_numbers(waved, value):
     gyro = waved.gyro.copy()
     gyro[[0, 40, 41, -1], 2] = value
@@ -78,7 +78,7 @@ def test_readings_that_are_no_numbers(waved, value):
     assert "4 of 2001 readings are not finite" in notes[0]
 
 
-@pytest.mark.parametrize("width", [0.004, 0.006, 0.01, 0.03])
+@each("width", [0.004, 0.006, 0.01, 0.03])
 def test_shocks_stay(waved, width):
     """Blows of 60 m/s^2, and of 6 rad/s, as long as a low-pass filter of an IMU makes them at least."""
     blows = np.arange(0.513, 9.8, 0.2037)

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
-from tests.cases import each
 
 from icalib.data.recordings import BagRecording
 from icalib.data.recordings.folder import FolderRecording
@@ -94,7 +93,7 @@ def check(found, stamps, T):
     np.testing.assert_allclose(found.position, T[:, :3, 3], atol=1e-12)
 
 
-@each("topic", [None, "/tf", "tf", "/tf_static"])
+@pytest.mark.parametrize("topic", [None, "/tf", "tf", "/tf_static"])
 def test_chain(bag_of, topic):
     bag = bag_of(MOVING, STATIC)
     stamps = [START + k * STEP for k in range(COUNT)]
