@@ -51,7 +51,7 @@ def test_options_with_a_default_name_it(prog: str):
             assert "default" in (action.help or ""), action.option_strings
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "answer"),
     [
         ("calibrat rig.yaml run", "there is no 'calibrat', did you mean 'calibrate'; available are calibrate, inspect"),

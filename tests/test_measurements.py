@@ -43,7 +43,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("kind", GOOD)
+@each("kind", GOOD)
 def test_seconds_count_from_the_first_stamp(kind):
     stream = kind("a", STAMPS, **GOOD[kind])
     assert stream.origin_ns == 10

@@ -67,7 +67,7 @@ def tables(text: str) -> Iterator[tuple[int, set[str]]]:
             yield node.lineno, found
 
 
-@pytest.mark.parametrize(
+@each(
     "text", ['X = ("rotation", "translation", "bloom")', '{"radii": 2, "baseline": 1, "scales": 2}',
              'X = [("tilt", 1), ("shape", 2), ("size", 3)]']
 )  # fmt: skip

@@ -56,7 +56,7 @@ def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
     assert rig_from_dict(rig_to_dict(rig), "rig.yaml").reference == "cam0"
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "words"),
     [
         (Rig(by_name(IMU, ImuSensor("imu1", "", IMU.noise), LIDAR)), "^imu1 is a second IMU beside imu0"),
@@ -74,7 +74,7 @@ def test_rigs_made_in_python_are_checked_as_rig_files_are(rig: Rig, words: str):
         check_complete(rig)
 
 
-@pytest.mark.parametrize(
+@each(
     "rig",
     [Rig(by_name(IMU, LIDAR)), Rig(by_name(IMU, ODOMETRY)), Rig(by_name(WHEELS, MOCAP)), Rig(by_name(GNSS, MOCAP))],
 )

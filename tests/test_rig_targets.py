@@ -67,7 +67,7 @@ def test_a_file_of_targets_alone_is_read(tmp_path: Path):
         assert load_target(tmp_path / "target.yaml") == MARKERS
 
 
-@pytest.mark.parametrize("spelling", ["apriltag_36h11", "DICT_APRILTAG_36h11", "36h11", "Tag36h11"])
+@each("spelling", ["apriltag_36h11", "DICT_APRILTAG_36h11", "36h11", "Tag36h11"])
 def test_spellings_of_a_family_are_one(written, spelling: str):
     assert load_rig(written(f"target: {TAGS.replace('tag36h11', spelling)}")).target == MARKERS
     board = load_rig(written(f"target: {CHARUCO.replace('5x5_100', spelling)}")).target
@@ -124,7 +124,7 @@ def test_what_is_wrong_is_named(written, text: str, words: str):
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     "others",
     [
         {"a": CHARUCO, "b": "{type: markers, family: 5x5_250, size: 0.1, ids: [17]}"},

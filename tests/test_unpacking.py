@@ -81,7 +81,7 @@ def test_headers_of_arrays_that_lie(header: str):
         load_arrays(archive("a", header, bytes(8)))
 
 
-@pytest.mark.parametrize("plane", [2**31, 2**31 - 1, -2, 5])
+@each("plane", [2**31, 2**31 - 1, -2, 5])
 def test_plane_ids_are_below_the_number_of_points(tmp_path: Path, plane: int):
     arrays = {
         "stamps_ns": np.arange(2) * 100_000_000,

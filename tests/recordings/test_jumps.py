@@ -155,8 +155,15 @@ def test_commands_that_read_an_imu_alone(tmp_path: Path):
     assert isinstance(FolderRecording(tmp_path).stamps("imu0/data.csv"), np.ndarray)
 
 
-@each("which", ["imu", "cameras"])
-@each("index", [500, 1400])
+@pytest.mark.parametrize(
+    ("which", "index"),
+    [
+        ("imu", 500),
+        ("cameras", 1400),
+        pytest.param("imu", 1400, marks=pytest.mark.full),
+        pytest.param("cameras", 500, marks=pytest.mark.full),
+    ],
+)
 def test_a_clock_that_is_set_by_seconds_is_named(simulation, which, index):
     m, by = simulation.measurements, 3 * 10**9
     at = m.imu.stamps_ns[index]
