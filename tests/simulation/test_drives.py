@@ -168,7 +168,7 @@ def test_a_recorded_motion_goes_through_its_poses(robot, swing_file, tmp_path, f
     np.testing.assert_allclose(middle, [0.0, 0.0, 0.45 * 3.2], atol=2e-2)
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "words"),
     [
         ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0\n", ":2: the line is not t x y z qx qy qz qw"),

@@ -6,7 +6,6 @@ import re
 from itertools import combinations
 
 import numpy as np
-import pytest
 from tests.cases import each
 
 from icalib.rig.kinds import SENSOR_TYPES
@@ -26,7 +25,7 @@ def test_streams_of_random_numbers_are_apart():
     assert all(abs(a - b) >= 1000 for a, b in combinations(first, 2)) and min(first) >= 1000
 
 
-@pytest.mark.parametrize("kind", OTHERS)
+@each("kind", OTHERS)
 def test_a_kind_declares_what_its_sensors_have(kind: str):
     simulated, inspector = simulated_kinds()[kind], inspectors()[kind]
     assert issubclass(simulated, SimSensor) and simulated.sensor_type == kind

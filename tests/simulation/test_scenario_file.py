@@ -219,9 +219,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(
-    ("good", "bad", "words"), [(good, bad, words) for good, cases in BAD.items() for bad, words in cases]
-)
+@each(("good", "bad", "words"), [(good, bad, words) for good, cases in BAD.items() for bad, words in cases])
 def test_a_bad_file_ends_in_a_sentence(tmp_path, good, bad, words):
     assert good in FULL
     with pytest.raises(RigError, match=words) as caught:
@@ -246,7 +244,7 @@ def test_stamps_of_today_have_19_digits(tmp_path):
     assert s.imu_clock_origin_ns == 1_700_000_000_000_000_000
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("duration: 3", "duration: 1000000", "imu0 would measure 200,000,000 readings, and 5,000,000 are the most"),
@@ -315,7 +313,7 @@ def test_effects_are_read(tmp_path):
     assert [p.scale for p in scenario.of(SimPoses)] == [0.99] and scenario.target_size == 1.01
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("0.03]", "3]", "effects.imu.accel_scale: must be between -0.2 and 0.2: 0.01 is 1 %"),
