@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from tests.cases import each
 
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
@@ -45,7 +46,7 @@ def test_a_lens_that_needs_no_third_coefficient_comes_back_without_it() -> None:
     assert largest < 1e-9
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "params", "target", "rms_range"),
     [
         (RADTAN5, EUROC5, RADTAN, (0.3, 1.0)),

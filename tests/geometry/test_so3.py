@@ -87,7 +87,7 @@ def test_log_of_half_a_turn_is_the_axis_up_to_sign() -> None:
         np.testing.assert_allclose(np.abs(so3.log(half_turn)), pi * np.eye(3)[i], atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [4.0, 2 * pi - 1e-6, 2 * pi + 1e-3, 10.0])
+@each("angle", [4.0, 2 * pi - 1e-6, 2 * pi + 1e-3, 10.0])
 def test_log_gives_the_short_way_round(angle: float) -> None:
     for phi in vectors(angle):
         np.testing.assert_allclose(so3.log(so3.exp(phi)), Rotation.from_rotvec(phi).as_rotvec(), atol=1e-14)
@@ -160,7 +160,7 @@ def test_coefficients_keep_their_digits(x: float) -> None:
         assert found == pytest.approx(float(expected), rel=1e-15 * (3 if k < 2 else 3 / min(max(x, 0.01), 1.0)))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_closest_rotation_is_that_of_the_wahba_problem(seed: int):
     rng = np.random.default_rng(seed)
     b = rng.normal(size=(6, 3))

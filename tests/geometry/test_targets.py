@@ -15,7 +15,7 @@ from icalib.geometry.targets.families import FAMILIES, family_name, opencv_bits,
 GRID = AprilGrid(rows=6, cols=7, tag_size=0.088, tag_spacing=0.3)  # not square, so that rows and columns differ
 
 
-@pytest.mark.parametrize(("row", "col"), [(0, 0), (0, 6), (1, 0), (3, 4), (5, 6)])
+@each(("row", "col"), [(0, 0), (0, 6), (1, 0), (3, 4), (5, 6)])
 def test_tags_run_row_major_and_corners_around(row: int, col: int) -> None:
     origin = np.array([col * 0.1144, row * 0.1144, 0.0])
     around = 0.088 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -36,7 +36,7 @@ def test_index_accepts_small_integers() -> None:
     np.testing.assert_array_equal(GRID.point_index(tags, np.array([3], dtype=np.int8)), [167])
 
 
-@pytest.mark.parametrize("tag", [-1, 42, 587])
+@each("tag", [-1, 42, 587])
 def test_unknown_tag(tag: int) -> None:
     with pytest.raises(RecordingError, match=rf"tag {tag} is not on the target \(6 x 7 tags, ids 0 to 41\)"):
         GRID.point_index(np.array([0, tag, 3]), np.array([0, 1, 2]))
@@ -91,7 +91,7 @@ def test_checkerboard_runs_row_by_row_from_the_bottom_left():
     np.testing.assert_allclose(BOARD.points[[1, 9, 53]], [[0.03, 0, 0], [0, 0.03, 0], [0.24, 0.15, 0]])
 
 
-@pytest.mark.parametrize(("rows", "cols", "symmetric"), [(6, 9, False), (6, 8, True), (7, 9, True), (6, 6, True)])
+@each(("rows", "cols", "symmetric"), [(6, 9, False), (6, 8, True), (7, 9, True), (6, 6, True)])
 def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
     """Colours of the squares, the board turned by half a turn."""
     black = np.indices((rows + 1, cols + 1)).sum(axis=0) % 2 == 0
@@ -104,9 +104,7 @@ def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
     assert not CHARUCO.symmetric and not GRID.symmetric
 
 
-@pytest.mark.parametrize(
-    ("rows", "cols", "quarters"), [(6, 8, (0, 2)), (7, 7, (0, 2)), (6, 6, (0, 1, 2, 3)), (6, 7, (0,))]
-)
+@each(("rows", "cols", "quarters"), [(6, 8, (0, 2)), (7, 7, (0, 2)), (6, 6, (0, 1, 2, 3)), (6, 7, (0,))])
 def test_turns_of_a_checkerboard_put_points_on_points(rows: int, cols: int, quarters: tuple[int, ...]):
     """Every turn by a multiple of 90 degrees about the middle that puts black on black, and no other."""
     board = Checkerboard(rows, cols, 0.03)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-import pytest
 from tests.cases import each
 
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
@@ -30,7 +29,7 @@ def test_limits_are_the_pinhole() -> None:
         relative_to_pinhole("omni-radtan", [0.0, *radtan], radtan)
 
 
-@pytest.mark.parametrize("xi", [0.2, 1.0, 2.5])
+@each("xi", [0.2, 1.0, 2.5])
 def test_three_models_share_the_unified_one(xi: float) -> None:
     """Geyer's model: Mei without distortion, EUCM with beta = 1 and double sphere with xi = 0."""
     alpha = xi / (1.0 + xi)

@@ -34,7 +34,7 @@ def test_of_parts_of_a_room(free_robot, faces, count):
     assert n_directions(seeing(free_robot.streams[0], faces)) == count
 
 
-@pytest.mark.parametrize("example", ["table2-planar", "table2-ramp", "straight-line"])
+@each("example", ["table2-planar", "table2-ramp", "straight-line"])
 def test_of_whole_rooms(robot, example):
     assert n_directions(robot(6.0, 1, example=example).streams[0]) == 3
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import EstimationError
 from icalib.estimate.problem.problem import Problem
@@ -178,9 +179,7 @@ def test_many_recordings(robot, example, turn, way, late, wrong):
         assert table.max(axis=1).sum() > (1.0 - wrong) * table.sum()
 
 
-@pytest.mark.parametrize(
-    ("shares", "lost"), [((0.15, 0.07, 0.06), True), ((0.1, 0.5, 0.9), False), ((0.1, 0.09), False)]
-)
+@each(("shares", "lost"), [((0.15, 0.07, 0.06), True), ((0.1, 0.5, 0.9), False), ((0.1, 0.09), False)])
 def test_planes_that_get_lost_from_round_to_round_are_an_error(shares: tuple[float, ...], lost: bool):
     with pytest.raises(EstimationError, match="lidar0.*15%, then 6%") if lost else nullcontext():
         check_shares(shares, "lidar0")

@@ -74,7 +74,7 @@ WRONG = [
 ]
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.full)])
 def sim(request):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([2.0, -0.5, 1.0]).as_matrix(), [0.1, -0.2, 0.15]

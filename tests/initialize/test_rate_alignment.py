@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
@@ -40,7 +41,7 @@ def _camera(seed: int) -> SensorRates:
     return SensorRates(seconds[:-1] - OFFSET, seconds[1:] - OFFSET, rate, least_correlation=0.3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_noise_of_the_images_is_not_taken_for_another_scale(seed: int):
     found = align_rates(_imu(1.0), "cam0", _camera(seed), None)
     assert found.offset == pytest.approx(OFFSET, abs=0.02)

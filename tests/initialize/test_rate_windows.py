@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.initialize.steps.smooth_trajectory import (
     MIN_HALF_WINDOW_S,
@@ -27,7 +28,7 @@ def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):
     return t, noisy.as_matrix(), w
 
 
-@pytest.mark.parametrize(("hz", "noise"), [(100.0, 1e-3), (30.0, 9e-3), (10.0, 2e-2)])
+@each(("hz", "noise"), [(100.0, 1e-3), (30.0, 9e-3), (10.0, 2e-2)])
 def test_the_noise_of_rotations_is_found(hz, noise):
     _, R, _ = turning(hz, noise)
     assert rotation_noise(R) == pytest.approx(noise, rel=0.15)

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from tests.cases import each
 from tests.typed import instance, not_none
-from threadpoolctl import threadpool_limits
 
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
@@ -28,13 +27,6 @@ PAPER = Path(__file__).parents[2] / "examples" / "paper"
 EDGE_M, PER_WALL = 0.25, 12
 RADTAN = camera_model("pinhole-radtan")
 EUROC = np.array([458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187e-05])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _one_thread():
-    """As in the program: threads of BLAS are slower on matrices so small."""
-    with threadpool_limits(limits=1, user_api="blas"):
-        yield
 
 
 @pytest.fixture(scope="module")

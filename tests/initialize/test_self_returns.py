@@ -52,7 +52,7 @@ def test_points_on_the_robot_are_found(robot, example, panel):
     assert own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
 
 
-@pytest.mark.parametrize(
+@each(
     ("example", "changes"),
     [("table2-planar", {"range_m": (0.5, 5.0)}), ("straight-line", {}), ("standing", {}), ("table2-planar", {})],
 )

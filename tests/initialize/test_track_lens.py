@@ -91,7 +91,7 @@ def test_every_model_is_found(lens: str):
     assert off_px(simulation, found) < 3e-3 * model.central_scale(found)
 
 
-@pytest.mark.parametrize(
+@each(
     ("example", "noise_px", "most_px"),
     [("table2-3d", 0.0, 0.7), ("table2-planar", 1.0, 3.0), ("table2-ramp", 1.0, 3.0), ("single-axis", 0.3, 3.0)],
 )
@@ -127,7 +127,12 @@ def test_tracks_of_another_drive_do_not_match():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens", "seed", "longest_s"),
-    [("radtan", 1, 5.0), ("radtan", 2, 0.25), ("fisheye", 3, 0.5), ("double sphere", 4, 5.0)],
+    [
+        pytest.param("radtan", 1, 5.0, marks=pytest.mark.full),
+        ("radtan", 2, 0.25),
+        ("fisheye", 3, 0.5),
+        pytest.param("double sphere", 4, 5.0, marks=pytest.mark.full),
+    ],
 )
 def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
     """Also where points are lost after five or ten images."""

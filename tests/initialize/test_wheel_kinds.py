@@ -82,8 +82,8 @@ def rates_at(kind, values, offset):
     return wheel_rates("wheel0", at - offset, integral[np.round((at - 3.0) * 1000).astype(int)], kind)
 
 
-@pytest.mark.parametrize(("kind", "values"), [("twist", TWIST), ("steered", STEERED)])
-@pytest.mark.parametrize("offset", [2.9123, -11.37])
+@each(("kind", "values"), [("twist", TWIST), ("steered", STEERED)])
+@each("offset", [2.9123, -11.37])
 def test_the_offset_is_found(kind, values, offset):
     """Of steered wheels tan is what counts, and it is not straight between the readings here."""
     found = wheel_offset(imu(), UP, "wheel0", rates_at(kind, values, offset))
