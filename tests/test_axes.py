@@ -8,7 +8,7 @@ import numpy as np
 from tests.cases import each
 
 from icalib.geometry import so3
-from icalib.motion.axes import hardly_turned, other_axes
+from icalib.motion.imu_data import hardly_turned, other_axes
 
 
 def keyframes(amplitude: list[float]) -> tuple[np.ndarray, np.ndarray]:

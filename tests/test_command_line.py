@@ -15,7 +15,7 @@ from tests.cases import each
 
 from icalib.cli import main
 from icalib.cli.commands import _parser
-from icalib.cli.console import LINE_EVERY_S, progress_bar, progress_lines
+from icalib.cli.console import LINE_EVERY_S, console_progress, progress_lines
 
 
 def commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
@@ -86,7 +86,7 @@ def test_long_work_prints_a_line_every_30_s(capsys: pytest.CaptureFixture[str]):
 def test_no_lines_where_it_is_quiet(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("icalib.cli.console.LINE_EVERY_S", 0.0)
     for quiet in (False, True):
-        with progress_bar(quiet) as show:
+        with console_progress(quiet) as show:
             show("reading", 0.5)
         assert ("icalib: reading, 50% after" in capsys.readouterr().err) != quiet
 

@@ -8,25 +8,25 @@ from pathlib import Path
 
 from tests.cases import each
 
-from icalib.rig.settings import Settings
-from icalib.sensors.camera.assess import lens_models
-from icalib.sensors.camera.inspect import findings as camera
-from icalib.sensors.imu.inspect import findings as imu
+from icalib.rig.rig import Settings
+from icalib.sensors.camera import inspect as camera
+from icalib.sensors.camera.assess import lenses
+from icalib.sensors.imu import inspect as imu
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.pose.spec import PoseSensor
-from icalib.tools.comparison.units import DEFAULT_TOLERANCES
-from icalib.validation import size
+from icalib.tools.comparison.compare import DEFAULT_TOLERANCES
+from icalib.validation import guesses
 
 DOCS = Path(__file__).parents[1] / "docs"
 T = DEFAULT_TOLERANCES
 STATED = [
     ("compare.md", f"{T['deg']:g} deg, {T['mm']:g} mm, {T['ms']:g} ms, {T['px']:g} px and {T['percent']:g} %"),
-    ("uncertainty.md", f"More than {size.WRONG:.0%} and {size.CLEARLY:g} standard deviations"),
-    ("uncertainty.md", f"more than {size.BEYOND:.0%} is `not usable`"),
-    ("faq.md", f"shows those from {size.WRONG:.0%} on"),
-    ("record.md", f"[from {size.WRONG:.0%}]"),
-    ("estimator.md", f"at most {lens_models.MOST_IMAGES} parts"),
-    ("estimator.md", f"a sign test over images at {lens_models.SIGN_TEST_SIGMAS:g} sigma"),
+    ("uncertainty.md", f"More than {guesses.WRONG:.0%} and {guesses.CLEARLY:g} standard deviations"),
+    ("uncertainty.md", f"more than {guesses.BEYOND:.0%} is `not usable`"),
+    ("faq.md", f"shows those from {guesses.WRONG:.0%} on"),
+    ("record.md", f"[from {guesses.WRONG:.0%}]"),
+    ("estimator.md", f"at most {lenses.MOST_IMAGES} parts"),
+    ("estimator.md", f"a sign test over images at {lenses.SIGN_TEST_SIGMAS:g} sigma"),
     ("inspect.md", f"in less than {camera.LEAST_SHARE:.0%} of the images"),
     ("inspect.md", f"tilted by more than {camera.FLAT_DEG:g} deg"),
     ("inspect.md", f"below {imu.STILL_RAD_S:g} rad/s RMS;"),

@@ -15,13 +15,13 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.base.input_files import FREE_BYTES
+from icalib.base.files import FREE_BYTES
 from icalib.base.yaml_nodes import parse_yaml, read_yaml
 from icalib.cli import main
-from icalib.data.images.images import DamagedImageError, decode, file_payload
-from icalib.data.tables.table import read_bytes
+from icalib.data.images import DamagedImageError, decode, file_payload
+from icalib.data.tables import read_bytes
 from icalib.errors import RecordingError, RigError
-from icalib.sensors.position.read.rtklib import read_pos
+from icalib.sensors.position.read.fixes import read_pos
 from icalib.tools.inspection import read_target
 from icalib.tools.inspection.kalibr import yaml_mapping
 

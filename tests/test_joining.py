@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.data.joining import join
-from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream
+from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream, join
 from icalib.errors import RecordingError
 from icalib.rig import ImuNoise, ImuSensor, Lidar, Rig, Wheels, by_name
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
+from icalib.sensors.camera.assess.lenses import _named_model, _Trial
 from tests.cases import each
 from tests.typed import instance
 
@@ -17,9 +18,8 @@ import icalib
 from icalib.base.yaml_nodes import YamlValue, parse_yaml
 from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
-from icalib.rig.file.targets import target_of
-from icalib.rig.kinds import SENSOR_TYPES
-from icalib.sensors.camera.assess.lens_models import _named_model, _Trial
+from icalib.rig.file import target_of
+from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.camera.spec import Camera
 
 SOURCE = Path(icalib.__file__).parent

@@ -8,10 +8,10 @@ from typing import Any, cast
 import numpy as np
 from tests.cases import each
 
-from icalib.observability.words import Observability, observe, sparse_basis
+from icalib.observability.determination import Observability, observe, sparse_basis
 from icalib.result import Verdict
 from icalib.rig import ParameterSpec
-from icalib.rig.kinds import ALL_SPECS
+from icalib.rig.rig import ALL_SPECS
 
 SPECS = {spec.name: spec for spec in ALL_SPECS}  # a name that an IMU and a camera share is the camera's
 SENSORS = ("cam0", "cam1", "cam2", "lidar0", "wheel0")

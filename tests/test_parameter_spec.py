@@ -11,11 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import specs_of, tolerance_of
 from tests.cases import each
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
-from icalib.estimate.problem.tolerances import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
 from icalib.model.sensor_model import own_entries
 from icalib.optim.state import make_layout
@@ -33,7 +33,7 @@ from icalib.rig import (
     by_name,
 )
 from icalib.rig.file import rig_from_dict, rig_to_dict
-from icalib.rig.kinds import ALL_SPECS, SENSOR_TYPES
+from icalib.rig.rig import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.fields import groups_to_plain, parameter_fields, parameters
 from icalib.sensors.imu.spec import class_noise
 

@@ -10,8 +10,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Ground, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
-from icalib.rig.complete import check_complete, lack_of
-from icalib.rig.file import rig_from_dict, rig_to_dict
+from icalib.rig.file import check_complete, lack_of, rig_from_dict, rig_to_dict
 from icalib.sensors.position.spec import PositionSensor
 
 GNSS = PositionSensor("gnss0", "")

@@ -5,7 +5,7 @@ from tests.cases import each
 
 from icalib.base.yaml_nodes import parse_yaml
 from icalib.errors import RigError
-from icalib.rig.gravity import Gravity, gravity_at, gravity_to_plain, parse_gravity
+from icalib.rig.rig import Gravity, gravity_at, gravity_to_plain, parse_gravity
 
 
 def parsed(text):

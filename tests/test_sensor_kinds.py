@@ -22,29 +22,29 @@ FREE = ("sensors/", "export/")  # exporters write the files of programs for cert
 NAMING = {
     "data/arrays.py",  # streams from arrays, for users
     "data/measurements.py",  # shorthand, for users
-    "detection/primitives/corners.py",  # the stream of the corners of images, for users
-    "initialize/assumed_sensors.py",  # they are an IMU and a pose sensor
+    "detection/decoding.py",  # the stream of the corners of images, for users
+    "initialize/assumed_motion.py",  # they are an IMU and a pose sensor
     "initialize/rig_guess.py",  # wheels that show the motion in place of the IMU
     "motion/imu_data.py",  # readings of the IMU, which link keyframes
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
-    "result/timeline.py",  # names of pictures in place of seconds
+    "result/calibration.py",  # names of pictures in place of seconds
     "tools/allan/analysis.py",  # the noise of IMUs
-    "tools/simulation/images/filming.py",
+    "tools/simulation/filming.py",
     "tools/simulation/rigs.py",
-    "tools/simulation/scenario/scenario.py",
-    "tools/simulation/scenario/scenario_file.py",
-    "tools/simulation/scenario/size.py",
-    "tools/simulation/sensor_bag.py",
-    "tools/simulation/sensors/corners.py",
-    "tools/simulation/sensors/motion.py",
-    "tools/simulation/sensors/simulate.py",
-    "tools/simulation/sensors/tracks.py",
-    "tools/simulation/tables.py",
+    "tools/simulation/scenario.py",
+    "tools/simulation/scenario_file.py",
+    "tools/simulation/scenario.py",
+    "tools/simulation/writing.py",
+    "tools/simulation/corners.py",
+    "tools/simulation/motion.py",
+    "tools/simulation/recording.py",
+    "tools/simulation/corners.py",
+    "tools/simulation/writing.py",
     "tools/simulation/writing.py",
     "validation/causes.py",  # checks that were made for the sensors of the rig
-    "validation/misfit.py",  # noise of the IMU
+    "validation/causes.py",  # noise of the IMU
 }
 
 

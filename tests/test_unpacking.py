@@ -14,10 +14,10 @@ import pytest
 from tests.cases import each
 
 from icalib.base.extras import load_lz4, load_zstd
-from icalib.base.input_files import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
+from icalib.base.files import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
-from icalib.sensors.lidar.read.scans import read_scans
+from icalib.sensors.lidar.read import read_scans
 
 LARGE = bytes(3 * FREE_BYTES)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from icalib.tools.simulation.motion import read_imu
 from tests.cases import each
 
 from icalib.cli import main
@@ -19,11 +20,20 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError, RecordingError
 from icalib.rig.file import load_rig
 from icalib.tools.allan import allan_deviation, study_imu, study_recording, write_study
-from icalib.tools.allan.analysis import allan_deviation_of_all, model_variance, still_readings
-from icalib.tools.allan.fit import AllanFit, _most_likely, _std, bands_of, bands_of_all, fit_noise, pooled
+from icalib.tools.allan.analysis import (
+    AllanFit,
+    _most_likely,
+    _std,
+    allan_deviation_of_all,
+    bands_of,
+    bands_of_all,
+    fit_noise,
+    model_variance,
+    pooled,
+    still_readings,
+)
 from icalib.tools.simulation import handheld
 from icalib.tools.simulation.output import IMU, BagForm, BagWriter
-from icalib.tools.simulation.sensors.imu import read_imu
 
 TRUTH = {"gyro": 1.6e-4, "gyro_walk": 2.2e-5, "accel": 2.8e-3, "accel_walk": 8.6e-4}
 REST = np.array([2e-3, -1e-3, 3e-3, 0.1, -0.2, 9.8])

@@ -5,16 +5,14 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+from icalib.detection.checkerboard import shows_grid
+from icalib.detection.decoding import ImageCorners
+from icalib.detection.detectors import checkerboard_in, detector_of
 from tests.cases import each
 
-from icalib.detection import CheckerboardDetector
-from icalib.detection.boards import checkerboard as module
-from icalib.detection.boards import diagnosis
-from icalib.detection.boards.checkerboard import shows_grid
-from icalib.detection.boards.detectors import detector_of
-from icalib.detection.boards.diagnosis import checkerboard_in
-from icalib.detection.primitives.corners import ImageCorners
-from icalib.detection.sightings import number_continuously
+from icalib.detection import CheckerboardDetector, detectors
+from icalib.detection import checkerboard as module
+from icalib.detection.images import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
 
 
@@ -39,7 +37,7 @@ def test_a_board_that_opencv_imagines_is_not_named(board, rendering, monkeypatch
     tags = rendering.aprilgrid(6, 6)
     image = rendering.render(tags, rendering.homography(tags, 0.9, 30.0, 20.0, 5.0, (0.0, 0.0)))
     assert checkerboard_in([board[0], board[0]]) == "a checkerboard of 6 x 9 inner corners"
-    monkeypatch.setattr(diagnosis, "_largest_boards", lambda image: [(3, 4)])
+    monkeypatch.setattr(detectors, "_largest_boards", lambda image: [(3, 4)])
     assert checkerboard_in([image, image]) == ""
 
 

@@ -6,6 +6,10 @@ import importlib
 
 import numpy as np
 import pytest
+from icalib.detection.decoding import with_verdicts
+from icalib.detection.detectors import detector_of
+from icalib.detection.tags import tag_family
+from icalib.geometry.targets.boards import pattern_of
 from tests.cases import each
 
 from icalib.base.extras import load_cv2
@@ -18,13 +22,9 @@ from icalib.detection import (
     MarkerDetector,
     corner_stream,
 )
-from icalib.detection.boards.detectors import detector_of
-from icalib.detection.primitives.corners import with_verdicts
-from icalib.detection.primitives.tags import tag_family
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.families import FAMILIES, opencv_bits
-from icalib.geometry.targets.pattern import pattern_of
 
 cv2 = pytest.importorskip("cv2")
 

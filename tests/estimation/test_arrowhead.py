@@ -5,8 +5,17 @@ import pytest
 from tests.cases import each
 
 from icalib.optim import arrowhead
-from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, marginalise_in_segments, solve
-from icalib.optim.calib_block import UNOBSERVABLE_BELOW, calib_draws, calib_step
+from icalib.optim.arrowhead import (
+    UNOBSERVABLE_BELOW,
+    NotDefiniteError,
+    Piece,
+    calib_draws,
+    calib_step,
+    make_pieces,
+    marginalise,
+    marginalise_in_segments,
+    solve,
+)
 from icalib.optim.state import KEYFRAME_DIM
 
 

@@ -7,7 +7,7 @@ import pytest
 from tests.cases import each
 
 from icalib.data.measurements import CornerStream
-from icalib.sensors.camera.corner_misfit import lens_misfit
+from icalib.sensors.camera.corner_noise import lens_misfit
 
 SIZE = np.array([752.0, 480.0])
 

@@ -6,16 +6,16 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import Inputs
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.problem.inputs import Inputs
 from icalib.geometry.cameras import camera_model
-from icalib.model.statistics import Fit
+from icalib.model.sensor_model import Fit
 from icalib.rig import Camera, Settings
-from icalib.sensors.camera.assess import lens_models
-from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.sensors.camera.assess import lenses
+from icalib.sensors.camera.corner_factor import DELAY, CornerNoise
 from icalib.sensors.camera.corner_noise import (
     NoiseModel,
     estimate_noise,
@@ -24,7 +24,6 @@ from icalib.sensors.camera.corner_noise import (
     image_speed,
     with_jitter,
 )
-from icalib.sensors.camera.corner_statistics import DELAY
 
 BASE, EXPOSURE_S = 0.08, 4e-4
 
@@ -76,12 +75,12 @@ def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     settings = Settings(blur_noise=True)
     assert estimate_noise(camera, settings, factor, out, speed)[1] == large
     fitted = SimpleNamespace(model=factor.model, rms=0.1)
-    monkeypatch.setattr(lens_models, "compare_models", lambda *_: (fitted, fitted))
+    monkeypatch.setattr(lenses, "compare_models", lambda *_: (fitted, fitted))
     outcome = SimpleNamespace(residuals={factor.key: out}, state=setup.state)
     found = SimpleNamespace(outcome=outcome, problem=SimpleNamespace(factors={factor.key: factor}))
     rig = SimpleNamespace(cameras=(camera,), settings=settings)
     inputs = SimpleNamespace(rig=rig, measurements=SimpleNamespace(cameras=(factor.stream,)))
-    assert len(list(lens_models.wrong_models(cast(Inputs, inputs), cast(Estimate, found)))) == large
+    assert len(list(lenses.wrong_models(cast(Inputs, inputs), cast(Estimate, found)))) == large
 
 
 def test_images_that_see_the_misfit_are_in_both_halves(unlike, setup_of, factor_of, monkeypatch):
@@ -93,8 +92,8 @@ def test_images_that_see_the_misfit_are_in_both_halves(unlike, setup_of, factor_
     images, seen = len(factor.stream.stamps_ns), np.isin(factor.stream.image, (2, 6))
     field = np.where(seen[:, None], 3.0, 0.01) * np.ones(2)
     for most in (40, 4):
-        monkeypatch.setattr(lens_models, "MOST_IMAGES", most)
-        rows, fitted, tested = not_none(lens_models._halves(factor, out, setup.state, field))
+        monkeypatch.setattr(lenses, "MOST_IMAGES", most)
+        rows, fitted, tested = not_none(lenses._halves(factor, out, setup.state, field))
         halves = np.split(rows, [len(fitted.uv)])
         assert len(halves[1]) == len(tested.uv)
         assert [np.unique(factor.stream.image[half[seen[half]]]).tolist() for half in halves] == [[2], [6]]
@@ -114,20 +113,20 @@ def test_the_region_of_the_misfit_is_named(places, words):
     uv = np.array([*places, (800, 500), *[(376, 10)] * 1000], float)  # the second kind is outside the image
     field = np.full((len(uv), 2), 1.0)
     field[: len(places)] = np.linspace(4.0, 3.0, len(places))[:, None]
-    assert lens_models.worst_regions(uv, field, (752, 480)) == words
+    assert lenses.worst_regions(uv, field, (752, 480)) == words
 
 
 @each(("left", "fewer", "beaten"), [(0.266, 20, True), (0.266, 14, False), (0.26, 20, False)])
 def test_models_are_compared_by_the_misfit_and_not_by_the_ratio_of_rms(monkeypatch, left, fewer, beaten):
     """The worse model has 0.091 px more of misfit than the other, or 0.071 px."""
     error = {"of": {}}
-    monkeypatch.setattr(lens_models._Trial, "rms", property(lambda trial: error["of"][id(trial)][0]))
-    monkeypatch.setattr(lens_models._Trial, "squared_error", property(lambda trial: error["of"][id(trial)][1]))
+    monkeypatch.setattr(lenses._Trial, "rms", property(lambda trial: error["of"][id(trial)][0]))
+    monkeypatch.setattr(lenses._Trial, "squared_error", property(lambda trial: error["of"][id(trial)][1]))
     no_fit: Any = None
-    old, new = (lens_models._Trial(camera_model(name), no_fit, no_fit) for name in ("pinhole-radtan", "eucm"))
+    old, new = (lenses._Trial(camera_model(name), no_fit, no_fit) for name in ("pinhole-radtan", "eucm"))
     error["of"] = {id(old): (left, np.ones(20)), id(new): (0.25, np.where(np.arange(20) < fewer, 0.9, 1.1))}
-    assert lens_models._beats(new, old, 0.084**2) == beaten
-    assert not lens_models._beats(old, new, 0.084**2)
+    assert lenses._beats(new, old, 0.084**2) == beaten
+    assert not lenses._beats(old, new, 0.084**2)
 
 
 @pytest.mark.parametrize("jitter_s", [0.0, 2e-3])

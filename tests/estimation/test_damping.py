@@ -6,11 +6,8 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
+from icalib.estimate.solver import CAREFUL_DAMPING, Damping, Descent, Step
 from tests.cases import each
-
-from icalib.estimate.problem.damping import CAREFUL_DAMPING, Damping
-from icalib.estimate.problem.descent import Descent
-from icalib.estimate.problem.outcome import Step
 
 
 @each(

@@ -4,10 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.corner_bias import with_bent_edges
+from icalib.tools.simulation.projection import project
 from tests.cases import each
-
-from icalib.sensors.camera.edge_curvature import with_bent_edges
-from icalib.tools.simulation.scenario.projection import project
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.track_surfaces import ON_PLANES
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 from tests.cases import each
@@ -29,23 +30,17 @@ from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
 from icalib.model.bodies import SIZE
 from icalib.motion.factor import output_at
-from icalib.motion.poses import poses_at
-from icalib.motion.sweep import EstimatedMotion
-from icalib.motion.time_offsets import offset_at
-from icalib.optim.arrowhead import Piece, make_pieces
-from icalib.optim.prior_factor import FIRST_BIAS_SIGMA, Prior, accumulate_bias_prior
-from icalib.optim.robust_weights import MIN_CURVATURE_RATIO
+from icalib.motion.poses import EstimatedMotion, offset_at, poses_at
+from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
+from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
-from icalib.sensors.camera.corner_factor import CornerNoise
-from icalib.sensors.camera.corner_statistics import DELAY, SHIFT
-from icalib.sensors.camera.features.surfaces import ON_PLANES
+from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
-from icalib.sensors.position.residual import PositionFactor, PositionNoise
+from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
 from icalib.sensors.position.stream import PositionStream
-from icalib.sensors.position.walk_factor import OffsetWalkFactor, knot_entries
 from icalib.sensors.wheels.ground_factor import GroundFactor
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 

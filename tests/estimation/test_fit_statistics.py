@@ -6,16 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.jacobian_noise import spurious_information
+from icalib.estimate.solver import Draws, Outcome, SolverOptions, minimise, posterior
 from tests.cases import each
 from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
 from tests.typed import not_none
 
-from icalib.estimate.problem.outcome import Draws, Outcome, posterior
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.solver_options import SolverOptions
-from icalib.estimate.residual_statistics.fit_statistics import fits
-from icalib.estimate.residual_statistics.jacobian_noise import spurious_information
+from icalib.estimate.residual_statistics import fits
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.sensors.camera.corner_factor import CornerFactor

@@ -7,8 +7,7 @@ import pytest
 from tests.cases import each
 
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
-from icalib.optim.front import PieceFeatures
-from icalib.optim.front_plan import GROUP_SIZES, FeatureSums, plan
+from icalib.optim.front import GROUP_SIZES, FeatureSums, PieceFeatures, plan
 from icalib.optim.state import KEYFRAME_DIM
 
 

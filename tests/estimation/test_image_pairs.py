@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.optim.robust_weights import LOSSES, robust_weights
+from icalib.optim.rows import LOSSES, robust_weights
 from icalib.rig import Settings
-from icalib.sensors.camera.assess.observation_notes import late_words
+from icalib.sensors.camera.assess import late_words
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise, CornerOutput
-from icalib.sensors.camera.image_pairs import not_simultaneous
+from icalib.sensors.camera.image_times import not_simultaneous
 
 NOISE_PX = 0.1
 

@@ -8,26 +8,23 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import Outcome, SolverOptions, minimise
+from icalib.sensors.camera.track_factor import FeatureFactor
+from icalib.sensors.camera.track_selection import _tag_corners
+from icalib.sensors.camera.track_selection import image_cells as cells_of
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
-from icalib.estimate.problem.assembly import assemble
-from icalib.estimate.problem.outcome import Outcome
-from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.problem.solver_options import SolverOptions
-from icalib.estimate.residual_statistics.image_regions import _cluster_gradients, _count, cluster_covariances
+from icalib.estimate.problem import Problem, assemble
+from icalib.estimate.residual_statistics import _cluster_gradients, _count, cluster_covariances
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies
 from icalib.motion.factor import FactorKey, of_type, output_at
-from icalib.optim.calib_block import restricted_inverse
+from icalib.optim.arrowhead import restricted_inverse
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
-from icalib.sensors.camera.features.error_clusters import _tag_corners
-from icalib.sensors.camera.features.error_clusters import image_cells as cells_of
-from icalib.sensors.camera.features.residual import FeatureFactor
 from icalib.sensors.camera.model import MODEL
 from icalib.tools.simulation import Scenario, load_scenario, rig_for, simulate, with_drawn_guess
 

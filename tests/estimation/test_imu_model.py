@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 
-from icalib.motion.imu_model import correction_matrices
+from icalib.motion.imu_data import correction_matrices
 from icalib.motion.integration_step import AT_INTRINSICS, J_STRIDE, RUN_SIZE, correction, fill_intrinsics
 from icalib.sensors.imu.spec import INTRINSICS_LABELS as LABELS
 from icalib.sensors.imu.spec import N_INTRINSICS

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.motion import reference_motion
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from tests.cases import each
@@ -9,12 +10,19 @@ from tests.cases import each
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
-from icalib.motion.integration import Increment, Readings, finish, integrate, integration_workspace
+from icalib.motion.integration import (
+    Increment,
+    Readings,
+    empty_prefix,
+    finish,
+    in_order_of_keyframes,
+    integrate,
+    integrate_from_keyframe,
+    integration_workspace,
+)
 from icalib.motion.integration_step import COVARIANCE_SIZE, RUN_SIZE, correction
-from icalib.motion.propagation import empty_prefix, in_order_of_keyframes, integrate_from_keyframe
 from icalib.rig import ImuNoise
 from icalib.tools.simulation import handheld
-from icalib.tools.simulation.sensors.motion import reference_motion
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])

@@ -6,24 +6,23 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for
 from tests.cases import each
 from tests.typed import not_none
 
-from icalib.data.joining import PAUSE_NS, join
-from icalib.data.measurements import Measurements
-from icalib.data.recordings.opening import naming, open_all
+from icalib.data.measurements import PAUSE_NS, Measurements, join
+from icalib.data.recordings import naming, open_all
 from icalib.errors import RecordingError
-from icalib.estimate.problem.assembly import assemble
-from icalib.estimate.problem.inputs import inputs_for
-from icalib.estimate.residual_statistics.segments import segment_ends
+from icalib.estimate.problem import assemble
+from icalib.estimate.residual_statistics import segment_ends
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
-from icalib.motion.keyframe_placement import first_keyframes, place_keyframes, usable
+from icalib.motion.poses import first_keyframes, place_keyframes, usable
 from icalib.optim.state import KEYFRAME_DIM, State
 from icalib.rig import Rig
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_noise import NoiseModel
-from icalib.sensors.camera.initialize.multi_recording import initial_guesses, initial_state
+from icalib.sensors.camera.initialize import initial_guesses, initial_state
 from icalib.sensors.camera.model import MODEL
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.parameter import fixed

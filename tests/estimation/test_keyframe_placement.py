@@ -5,7 +5,7 @@ from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
-from icalib.motion.keyframe_placement import place_keyframes, usable
+from icalib.motion.poses import place_keyframes, usable
 from icalib.rig import ImuNoise
 
 

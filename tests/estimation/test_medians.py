@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.optim.medians import grouped_quantiles, largest_normal, median_variance
+from icalib.optim.rows import grouped_quantiles, largest_normal, median_variance
 
 
 def test_the_variance_is_that_of_the_noise_whatever_outliers_do():

@@ -6,17 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import Outcome, minimise
 from tests.typed import not_none
 
-from icalib.estimate.problem.outcome import Outcome
-from icalib.estimate.problem.problem import Problem
-from icalib.estimate.problem.solver import minimise
-from icalib.estimate.residual_statistics.fit_statistics import split_covariance, split_expectation
-from icalib.estimate.residual_statistics.inflation import noise_variance
-from icalib.estimate.residual_statistics.segments import Segments
+from icalib.estimate.problem import Problem
+from icalib.estimate.residual_statistics import Segments, noise_variance, split_covariance, split_expectation
 from icalib.motion.factor import keyed
-from icalib.optim.arrowhead import KEYFRAME_DIM, Piece
-from icalib.optim.prior_factor import Prior
+from icalib.optim.arrowhead import KEYFRAME_DIM, Piece, Prior
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.tools.simulation import handheld, simulate
 

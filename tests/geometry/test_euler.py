@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 
-from icalib.geometry.euler import LEAST_SIGMAS, rpy, rpy_jacobian, rpy_std
+from icalib.geometry.so3 import LEAST_SIGMAS, rpy, rpy_jacobian, rpy_std
 
 RNG = np.random.default_rng(3)
 COVARIANCE = np.deg2rad(0.2) ** 2 * np.array([[1.0, 0.5, -0.3], [0.5, 2.0, 0.4], [-0.3, 0.4, 0.5]])

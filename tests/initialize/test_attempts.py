@@ -7,7 +7,7 @@ from types import SimpleNamespace
 from tests.cases import each
 
 from icalib.errors import EstimationError
-from icalib.initialize.attempts import explained_failure
+from icalib.initialize.rig_guess import explained_failure
 from icalib.optim.arrowhead import NOT_DEFINITE, NotDefiniteError
 from icalib.rig import Camera, ImuNoise, ImuSensor, PoseSensor, Rig, by_name
 

@@ -13,7 +13,7 @@ from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
 from icalib.rig import Axes, ImuSensor, Rig
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess
-from icalib.sensors.imu.read.units import in_si
+from icalib.sensors.imu.read import in_si
 from icalib.tools.simulation import handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

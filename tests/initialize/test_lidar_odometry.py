@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.initialize.rate_correlation import GyroRotation
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.steps.gyro_rotation import GyroRotation
-from icalib.initialize.trajectories.imu_trajectory import ImuTrajectory, SignalIntegrals
-from icalib.initialize.trajectories.lever_arm_rows import system_from_readings, system_from_trajectory
+from icalib.initialize.trajectories import ImuTrajectory, SignalIntegrals, system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
 from icalib.sensors.lidar.initialize.odometry import (
     ACCELERATION_SIGMA,

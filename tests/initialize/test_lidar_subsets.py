@@ -9,7 +9,7 @@ import pytest
 from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.motion.plane_association import PlaneAssociation
+from icalib.motion.point_planes import PlaneAssociation
 from icalib.pipeline import calibrate_measurements
 from icalib.sensors.lidar.initialize import association
 from icalib.sensors.lidar.initialize.association import AssociatedPlanes, _first_points, _unthinned, odd_step

@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.initialize.hand_eye import PosePairs, hand_eye, unexplained_motion
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
-from icalib.initialize.steps.hand_eye import PosePairs, hand_eye, unexplained_motion
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.sensors.pose.initialize.conventions import Convention, best_convention, with_checked_convention
-from icalib.sensors.pose.read.checks import checked_poses
-from icalib.sensors.pose.read.pose_tables import as_frame_sensor, read_pose_file
+from icalib.sensors.pose.read import checked_poses
+from icalib.sensors.pose.read.transforms import as_frame_sensor, read_pose_file
 
 RNG = np.random.default_rng(3)
 N = 14

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from tests.cases import each
-
-from icalib.initialize.steps.smooth_trajectory import (
+from icalib.initialize.smooth_trajectory import (
     MIN_HALF_WINDOW_S,
     rate_window,
     rotation_noise,
     smooth_trajectory,
     window_rates,
 )
+from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):

@@ -12,13 +12,13 @@ import pytest
 from tests.cases import each
 from tests.typed import instance
 
-from icalib.data.bags.ros1 import Ros1Storage
+from icalib.data.bags import Ros1Storage
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import Recording, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.read import checked_imu
 from icalib.sensors.imu.read import readings as imu_readings
-from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.spec import class_noise
 
 IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
@@ -282,7 +282,7 @@ class TestNoBag:
         assert "/imu: messages have the encoding 'xml', which is not one of ROS" in sentence
 
     def test_without_rosbags_the_sentence_names_the_extra(self, tmp_path, truth, write, monkeypatch):
-        from icalib.data.recordings import bag
+        from icalib.data import bag_recording as bag
 
         recording = open_recording(write.small("mcap", tmp_path, truth))
         monkeypatch.setitem(sys.modules, "rosbags.typesys", None)

@@ -15,10 +15,9 @@ from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
-from icalib.sensors.lidar.read import scans as recorded_scans
-from icalib.sensors.lidar.read.checks import checked_lidar
-from icalib.tools.inspection import inspect_recording
-from icalib.tools.inspection.draft import draft_rig
+from icalib.sensors.lidar import read as recorded_scans
+from icalib.sensors.lidar.read.point_clouds import checked_lidar
+from icalib.tools.inspection import draft_rig, inspect_recording
 
 POINTS = "sensor_msgs/msg/PointCloud2"
 ORIGIN, PERIOD, SCANS = 1_700_000_000_123_456_789, 100_000_000, 12  # ns

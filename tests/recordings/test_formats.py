@@ -16,15 +16,15 @@ import pytest
 from tests.cases import each
 from tests.typed import instance
 
-from icalib.data.bags.opening import bag_files
+from icalib.data.bags import bag_files
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import BagRecording, Recording, decode, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuSensor, Rig, by_name
 from icalib.sensors.camera.read import image_topics
+from icalib.sensors.imu.read import checked_imu
 from icalib.sensors.imu.read import readings as imu_readings
-from icalib.sensors.imu.read.checks import checked_imu
 from icalib.sensors.imu.spec import class_noise
 
 FORMS = [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.data.images.images import file_payload, file_size
+from icalib.data.images import file_payload, file_size
 from icalib.data.recordings import DamagedImageError, Payload, decode
 from icalib.errors import RecordingError
 

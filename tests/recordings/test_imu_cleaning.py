@@ -9,8 +9,8 @@ import pytest
 from tests.cases import each
 
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps.even import EvenStamps, even_stamps, followed
-from icalib.sensors.imu.read.checks import checked_imu
+from icalib.data.stamps import EvenStamps, even_stamps, followed
+from icalib.sensors.imu.read import checked_imu
 from icalib.tools.simulation import handheld, simulate
 
 

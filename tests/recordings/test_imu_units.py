@@ -11,7 +11,7 @@ from tests.cases import each
 from icalib.data.measurements import ImuStream
 from icalib.errors import RecordingError
 from icalib.rig import ImuSensor
-from icalib.sensors.imu.read.checks import checked_imu
+from icalib.sensors.imu.read import checked_imu
 from icalib.sensors.imu.spec import class_noise
 from icalib.tools.simulation import handheld, simulate
 

@@ -20,8 +20,7 @@ from icalib.data.measurements import (
     WheelStream,
 )
 from icalib.data.recordings import FolderRecording
-from icalib.data.stamps.jumps import ClockJumps, longest_part
-from icalib.data.stamps.sections import section
+from icalib.data.stamps import ClockJumps, longest_part, section
 from icalib.errors import EstimationError, RecordingError
 from icalib.pipeline import calibrate_measurements
 from icalib.tools.allan import study_recording

@@ -10,18 +10,17 @@ from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.recordings import FolderRecording, read_measurements
-from icalib.data.stamps.clocks import unit_of_stamps, usual_step
-from icalib.data.tables.columns import TableKind
-from icalib.data.tables.table import holds, named, read_table
+from icalib.data.stamps import unit_of_stamps, usual_step
+from icalib.data.tables import TableKind, holds, named, read_table
 from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.sensors.camera.read import tracks as recorded_tracks
-from icalib.sensors.imu.read.table_kinds import IMU
+from icalib.sensors.camera import read as recorded_tracks
+from icalib.sensors.imu.read import IMU
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.pose.read import readings as pose_readings
+from icalib.sensors.wheels.read import WheelReadings
 from icalib.sensors.wheels.read import readings as wheel_readings
-from icalib.sensors.wheels.read.raw_readings import WheelReadings
 
 ORIGIN, STEP, N = 1_700_000_000_123_456_789, 5_000_000, 60
 STAMPS = ORIGIN + STEP * np.arange(N)

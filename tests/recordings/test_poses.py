@@ -14,9 +14,9 @@ from icalib.data.recordings import BagRecording, FolderRecording, open_recording
 from icalib.errors import RecordingError
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict, rig_to_dict
+from icalib.sensors.pose.read import checked_poses
 from icalib.sensors.pose.read import readings as pose_readings
-from icalib.sensors.pose.read.checks import checked_poses
-from icalib.sensors.pose.read.pose_tables import PoseReadings, as_frame_sensor
+from icalib.sensors.pose.read.transforms import PoseReadings, as_frame_sensor
 
 N, STEP, ORIGIN = 300, 20_000_000, 1_700_000_000_123_456_789
 STAMPS = ORIGIN + STEP * np.arange(N)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.sensors.imu.scatter import quiet_scatter
+from icalib.sensors.imu.assess import quiet_scatter
 
 RATE = 200.0
 

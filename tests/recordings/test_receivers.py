@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.data.recording import Reading
 from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.recordings import open_recording
-from icalib.data.recordings.base import Reading
 from icalib.errors import RecordingError
 from icalib.rig import Rig, by_name
 from icalib.sensors.position.read import read

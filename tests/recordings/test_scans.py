@@ -11,13 +11,12 @@ from tests.cases import each
 
 from icalib.cli import main
 from icalib.data.measurements import LidarStream
-from icalib.data.recordings import FolderRecording, open_recording
-from icalib.data.recordings.opening import read_measurements
+from icalib.data.recordings import FolderRecording, open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
-from icalib.sensors.lidar.read import scans
-from icalib.sensors.lidar.read.checks import checked_lidar
+from icalib.sensors.lidar import read as scans
+from icalib.sensors.lidar.read.point_clouds import checked_lidar
 
 LIDAR = Lidar("lidar0", "lidar0/scans.npz")
 RNG = np.random.default_rng(2)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from tests.cases import each
 
-from icalib.data.tables.columns import TableKind
-from icalib.data.tables.table import read_table
+from icalib.data.tables import TableKind, read_table
 from icalib.errors import RecordingError
 
 INTEGERS, DECIMALS = ("t [ns]", "id"), ("u", "v")

@@ -11,7 +11,7 @@ from tests.cases import each
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RecordingError, RigError
 from icalib.rig.file import load_rig, rig_to_dict
-from icalib.sensors.camera.read.tracks import read_tracks
+from icalib.sensors.camera.read import read_tracks
 
 GOOD = "#t [ns],feature,u [px],v [px]\n1000000000,7,10.5,20\n1000000000,3,11,21\n1050000000,7,10.75,20.25\n"
 RIG = """

@@ -11,14 +11,14 @@ from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import ImuStream
+from icalib.data.messages import type_not_read
 from icalib.data.recordings import open_recording
-from icalib.data.topics import type_not_read
 from icalib.errors import RecordingError
 from icalib.rig import Camera, ImuSensor, Lidar
 from icalib.sensors.camera.read import has_corners
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise
-from icalib.sensors.lidar.read import scans
+from icalib.sensors.lidar import read as scans
 from icalib.tools.inspection import inspect_recording
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"

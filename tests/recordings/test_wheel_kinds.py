@@ -13,9 +13,8 @@ from icalib.data.measurements import WheelStream
 from icalib.data.recordings import BagRecording, FolderRecording
 from icalib.errors import RecordingError
 from icalib.rig import Wheels
+from icalib.sensors.wheels.read import WheelReadings, checked_wheels
 from icalib.sensors.wheels.read import readings as wheel_readings
-from icalib.sensors.wheels.read.checks import checked_wheels
-from icalib.sensors.wheels.read.raw_readings import WheelReadings
 
 N, STEP, ORIGIN = 400, 20_000_000, 1_700_000_000_000_000_000
 STAMPS = ORIGIN + STEP * np.arange(N)

@@ -14,15 +14,14 @@ from tests.typed import instance
 
 from icalib.cli import main
 from icalib.data.measurements import ImuStream
-from icalib.data.recordings import open_recording
-from icalib.data.recordings.opening import open_all
-from icalib.data.stamps.window import Window, start_of
+from icalib.data.recordings import open_all, open_recording
+from icalib.data.stamps import Window, start_of
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import Camera, ImuSensor, PoseSensor, TwoSources, Wheels
-from icalib.sensors.camera.read import tracks as recorded_tracks
+from icalib.sensors.camera import read as recorded_tracks
+from icalib.sensors.imu.read import ImuHalves
 from icalib.sensors.imu.read import readings as imu_readings
-from icalib.sensors.imu.read.halves import ImuHalves
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.pose.read import readings as pose_readings
 from icalib.sensors.wheels.read import readings as wheel_readings

@@ -6,6 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.filming import Interior, RoomRenderer
+from icalib.tools.simulation.projection import project
+from icalib.tools.simulation.rendering import pixel_kernel, shrink, unproject
+from icalib.tools.simulation.room import atlas_of, dead_leaves, distances
 from tests.cases import each
 
 from icalib.errors import RigError
@@ -21,12 +25,7 @@ from icalib.tools.simulation import (
     film,
     hills_of_slope,
 )
-from icalib.tools.simulation.images.interior import Interior, RoomRenderer
-from icalib.tools.simulation.images.rendering import pixel_kernel, shrink, unproject
-from icalib.tools.simulation.scenario.image_faults import faults_of
-from icalib.tools.simulation.scenario.projection import project
-from icalib.tools.simulation.scenario.room import distances
-from icalib.tools.simulation.scenario.texture import atlas_of, dead_leaves
+from icalib.tools.simulation.scenario import faults_of
 
 from .conftest import DISTORTED
 

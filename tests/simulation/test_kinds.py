@@ -8,10 +8,10 @@ from itertools import combinations
 import numpy as np
 from tests.cases import each
 
-from icalib.rig.kinds import SENSOR_TYPES
+from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.camera.spec import Camera
-from icalib.tools.inspection.kinds import inspectors
-from icalib.tools.simulation.scenario.sensor import SimSensor, simulated_kinds
+from icalib.tools.inspection.facts import inspectors
+from icalib.tools.simulation.scenario import SimSensor, simulated_kinds
 
 OTHERS = [name for name, kind in SENSOR_TYPES.items() if not kind.is_inertial and kind is not Camera]
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.trajectory import DriveKind
 from tests.cases import each
 from tests.typed import instance
 
@@ -15,9 +16,7 @@ from icalib.errors import RigError
 from icalib.rig.file import load_rig
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import simulate
-from icalib.tools.simulation.scenario.robot import DriveKind
-from icalib.tools.simulation.sensor_bag import write_sensors
-from icalib.tools.simulation.tables import write_tables
+from icalib.tools.simulation.writing import write_sensors, write_tables
 
 from .conftest import alone, on_ground, wheel_path
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from icalib.detection.tracker import epipolar_errors
 from tests.cases import each
 
-from icalib.detection.tracking.epipolar import epipolar_errors
-from icalib.sensors.camera.read.moving import moving_features
+from icalib.sensors.camera.read.image_tracks import moving_features
 
 SIZE = (752, 480)
 CENTRE = np.array([375.5, 239.5])

@@ -8,9 +8,8 @@ from tests.cases import each
 from icalib.data.measurements import WheelStream
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import make_layout
-from icalib.sensors.wheels.drive_rows import coefficients
-from icalib.sensors.wheels.integrals import integrals_of
-from icalib.sensors.wheels.residual import IncrementFactor, WheelNoise
+from icalib.sensors.wheels.increment_kernels import coefficients
+from icalib.sensors.wheels.residual import IncrementFactor, WheelNoise, integrals_of
 
 DRIVES = {
     "twist": {"scales": np.array([1.1, 0.9])},
