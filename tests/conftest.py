@@ -16,6 +16,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401 its BLAS is another than that of numpy
+from threadpoolctl import threadpool_limits
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 WHOLE_RUNS = ("acceptance", "consistency")  # folders of tests that calibrate from measurements to the result
@@ -47,6 +49,13 @@ def pytest_collection_finish() -> None:
     """What was collected stays to the end: the garbage collector need not look through it again and again."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_blas_thread() -> Iterator[None]:
+    """As in a calibration: on matrices so small, further threads only wait, which takes most of the processor time."""
+    with threadpool_limits(limits=1, user_api="blas"):
+        yield
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data import arrays
 from icalib.errors import RecordingError
@@ -71,7 +72,7 @@ def test_every_other_kind():
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "words"),
     [
         (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import accumulate
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.geometry import so3
 from icalib.motion.imu_data import hardly_turned, other_axes
@@ -19,7 +19,7 @@ def keyframes(amplitude: list[float]) -> tuple[np.ndarray, np.ndarray]:
     return t, np.array(list(accumulate(steps, np.matmul, initial=np.eye(3))))
 
 
-@pytest.mark.parametrize(
+@each(
     ("amplitude", "words"),
     [
         ([0.4, 0.3, 0.2], ""),

@@ -252,7 +252,7 @@ BROKEN: list[tuple[Callable[[Tables], None], str]] = [
 ]
 
 
-@pytest.mark.parametrize("damage, words", BROKEN, ids=lambda x: getattr(x, "__name__", ""))
+@pytest.mark.parametrize("damage, words", BROKEN)
 def test_a_broken_recording_is_refused_in_one_sentence(tables, tmp_path, capsys, damage, words):
     damage(tables)
     assert re.search(words, refusal(tables, tmp_path, capsys))

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from tests.cases import each
 
 from icalib.cli import main
 from icalib.cli.commands import _parser
@@ -29,7 +30,7 @@ def commands(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParse
 COMMANDS = {p.prog: p for p in commands(_parser())}
 
 
-@pytest.mark.parametrize("prog", COMMANDS)
+@each("prog", COMMANDS)
 def test_each_command_has_examples_that_parse_and_says_what_each_option_does(prog: str):
     parser = COMMANDS[prog]
     assert all(action.help for action in parser._actions if not isinstance(action, argparse._SubParsersAction))
@@ -42,7 +43,7 @@ def test_each_command_has_examples_that_parse_and_says_what_each_option_does(pro
             assert callable(_parser().parse_args(words).run)
 
 
-@pytest.mark.parametrize("prog", COMMANDS)
+@each("prog", COMMANDS)
 def test_options_with_a_default_name_it(prog: str):
     for action in COMMANDS[prog]._actions:
         plain = not action.option_strings or action.required or action.const is True or action.default in (None, [])
@@ -50,7 +51,7 @@ def test_options_with_a_default_name_it(prog: str):
             assert "default" in (action.help or ""), action.option_strings
 
 
-@pytest.mark.parametrize(
+@each(
     ("words", "answer"),
     [
         ("calibrat rig.yaml run", "there is no 'calibrat', did you mean 'calibrate'; available are calibrate, inspect"),

@@ -6,7 +6,7 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
-import pytest
+from tests.cases import each
 
 from icalib.rig.rig import Settings
 from icalib.sensors.camera import inspect as camera
@@ -44,7 +44,7 @@ def page(name: str) -> str:
     return re.sub(r"(\d) %", r"\1%", " ".join((DOCS / name).read_text(encoding="utf-8").split()))
 
 
-@pytest.mark.parametrize(("name", "words"), STATED)
+@each(("name", "words"), STATED)
 def test_a_page_states_the_number_of_the_program(name: str, words: str):
     assert words.replace(" %", "%") in page(name)
 

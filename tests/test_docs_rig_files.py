@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import pytest
+from tests.cases import each
 
 from icalib.rig.file import load_rig
 
@@ -20,7 +20,7 @@ def rig_files() -> list[tuple[str, str]]:
     return [(f"{page} {k}", found) for page, text in texts.items() for k, found in enumerate(WHOLE.findall(text), 1)]
 
 
-@pytest.mark.parametrize(("name", "text"), rig_files(), ids=lambda value: value.split("\n")[0])
+@each(("name", "text"), rig_files())
 def test_a_rig_file_of_the_documentation_can_be_loaded(name: str, text: str, tmp_path: Path):
     (tmp_path / "rig.yaml").write_text(text)
     rig = load_rig(tmp_path / "rig.yaml")

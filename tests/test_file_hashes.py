@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.base.files import HashedFile, hash_of, load_arrays
 from icalib.data.recordings import open_recording
@@ -22,7 +23,7 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-@pytest.mark.parametrize(
+@each(
     "seen",
     [
         [],

@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 import yaml
+from tests.cases import each
 
 from icalib import cli
 
@@ -34,7 +35,7 @@ def test_some_cases():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-@pytest.mark.parametrize(
+@each(
     ("said", "content", "fault"),
     [
         ("icalib: a.yaml:1: must be a mapping, but is 'nan nan nan ...'.\n", b"nan\nnan\nnan\nnan\n", False),
@@ -53,8 +54,8 @@ def test_numbers_that_are_none_may_only_be_quoted(said: str, content: bytes, fau
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1.0])
-@pytest.mark.parametrize("suffix", [".json", ".yaml"])
+@each("value", [float("nan"), float("inf"), 1.0])
+@each("suffix", [".json", ".yaml"])
 def test_results_may_quote_nan_but_hold_none(value: float, suffix: str, benchmark_program, tmp_path: Path):
     path = tmp_path / f"made{suffix}"
     plain = {"notes": ["a.csv:3: wx is '.nan', which is not a number"], "sensors": {"cam0": {"std": [1.0, value]}}}

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.base.files import FREE_BYTES
 from icalib.base.yaml_nodes import parse_yaml, read_yaml
@@ -48,8 +49,8 @@ def sentence(capsys: pytest.CaptureFixture[str], *command: str) -> str:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="there are no such devices")
-@pytest.mark.parametrize("command", COMMANDS)
-@pytest.mark.parametrize("place", ["/dev/zero", "pipe"])
+@each("command", COMMANDS)
+@each("place", ["/dev/zero", "pipe"])
 def test_devices_and_pipes_are_not_read(command: str, place: str, tmp_path: Path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
@@ -66,8 +67,8 @@ def test_a_table_of_a_recording_may_be_none(tmp_path: Path):
         read_bytes(tmp_path / "data.csv")
 
 
-@pytest.mark.parametrize("path", ["", " ", "a\0b"])
-@pytest.mark.parametrize("command", [*COMMANDS, "output"])
+@each("path", ["", " ", "a\0b"])
+@each("command", [*COMMANDS, "output"])
 def test_paths_that_are_none(command: str, path: str, capsys, tmp_path: Path, monkeypatch):
     """An empty one would be the current folder."""
     monkeypatch.chdir(tmp_path)
@@ -102,7 +103,7 @@ def test_aliases_are_counted_as_written_out(tmp_path: Path):
         read_target(tmp_path / "april.yaml")
 
 
-@pytest.mark.parametrize("value", ['!!int ""', '!!float ""', "!!bool x", "!!timestamp x", "!!binary é", "{[1]: 2}"])
+@each("value", ['!!int ""', '!!float ""', "!!bool x", "!!timestamp x", "!!binary é", "{[1]: 2}"])
 def test_tags_of_a_kalibr_file_that_fit_no_value(value: str, tmp_path: Path):
     (tmp_path / "imu.yaml").write_text(f"update_rate: {value}\n")
     assert yaml_mapping(tmp_path / "imu.yaml") == {}

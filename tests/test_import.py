@@ -6,6 +6,7 @@ import subprocess
 import sys
 
 import pytest
+from tests.cases import each
 
 import icalib
 
@@ -39,7 +40,7 @@ def test_the_pipeline_does_without_what_takes_long_to_load():
     assert run.stdout.strip() == "set()"
 
 
-@pytest.mark.parametrize("name", icalib.__all__)
+@each("name", icalib.__all__)
 def test_every_public_name_is_there(name: str):
     assert getattr(icalib, name) is not None
     assert name in dir(icalib)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import CornerStream, ImuStream, LidarStream, Measurements, WheelPoses, WheelStream, join
 from icalib.errors import RecordingError
@@ -27,7 +28,7 @@ def recording(seed: int, origin_s: int, lidar_s: tuple[int, int], wheels_s: tupl
     return Measurements.of_streams(readings, lidar, wheels, name=f"r{seed}")
 
 
-@pytest.mark.parametrize("origins", [(0, 20), (20, 0), (7, 7)])
+@each("origins", [(0, 20), (20, 0), (7, 7)])
 def test_all_streams_are_shifted_alike_and_stay_apart(origins):
     parts = [recording(k, s, lidar, (2, 9)) for k, s, lidar in zip((1, 2), origins, ((0, 10), (3, 8)), strict=True)]
     joined, found = join(RIG, parts)

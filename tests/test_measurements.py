@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import CornerStream, LidarStream, TrackStream, WheelPoses, WheelStream
 from icalib.errors import RecordingError
@@ -42,7 +43,7 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize("kind", GOOD)
+@each("kind", GOOD)
 def test_seconds_count_from_the_first_stamp(kind):
     stream = kind("a", STAMPS, **GOOD[kind])
     assert stream.origin_ns == 10
@@ -51,7 +52,7 @@ def test_seconds_count_from_the_first_stamp(kind):
         np.testing.assert_array_equal(stream.image, [0, 0, 2, 2, 2])
 
 
-@pytest.mark.parametrize(("kind", "field", "value", "words"), BAD)
+@each(("kind", "field", "value", "words"), BAD)
 def test_what_does_not_belong_together_is_refused(kind, field, value, words):
     with pytest.raises(RecordingError, match=words):
         kind("a", STAMPS, **GOOD[kind] | {field: value})

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 import yaml
+from icalib.sensors.camera.assess.lenses import _named_model, _Trial
+from tests.cases import each
 from tests.typed import instance
 
 import icalib
@@ -18,7 +20,6 @@ from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
 from icalib.rig.file import target_of
 from icalib.rig.rig import SENSOR_TYPES
-from icalib.sensors.camera.assess.lenses import _named_model, _Trial
 from icalib.sensors.camera.spec import Camera
 
 SOURCE = Path(icalib.__file__).parent
@@ -200,7 +201,7 @@ def _read(value: str) -> Any:
     return yaml.safe_load(re.sub(r"«([^»]*)»", lambda m: EXAMPLES[m[1]], value))
 
 
-@pytest.mark.parametrize(("module", "field", "value"), advice())
+@each(("module", "field", "value"), advice())
 def test_a_field_that_a_message_names_is_accepted(module: str, field: str, value: str):
     kinds = [kind for kind in SENSOR_TYPES if field in FIELDS[kind]]
     own = [kind for kind in kinds if module.startswith(f"sensors/{kind}/")]

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.observability.determination import Observability, observe, sparse_basis
 from icalib.result import Verdict
@@ -43,7 +43,7 @@ def verdicts_of(found: Observability) -> tuple[Verdict, ...]:
     return found.verdicts(np.arange(len(found.spread)), found.spread)
 
 
-@pytest.mark.parametrize(("worth", "verdict"), [(50.0, "unobservable"), (1.0, "determined"), (10.0, "weak")])
+@each(("worth", "verdict"), [(50.0, "unobservable"), (1.0, "determined"), (10.0, "weak")])
 def test_what_five_share_is_as_open_as_the_guess_is_wide(worth: float, verdict: str):
     """A fifth of a direction each: the share alone would let none of them be open."""
     names = tuple(f"{s}.rotation.z" for s in SENSORS) + ("cam0.time_offset.time_offset",)
@@ -66,7 +66,7 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
     assert observe(found, names, specs_of(names)).unobservable[0].startswith("left_cam time offset: ")
 
 
-@pytest.mark.parametrize(
+@each(
     ("parameter", "on_wheels", "has_target", "advice"),
     [
         ("cam0.distortion.k1", False, True, "by these images; show the target in the corners of the image"),

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 import icalib
 from icalib.errors import RigError
@@ -38,7 +39,7 @@ def test_a_rotation_of_few_digits_is_made_exact_and_an_exact_one_stays():
     assert (icalib.fixed(exact).value == exact).all()
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "words"),
     [
         (lambda: icalib.fixed([0.0, np.nan]), "NaN or infinite"),
@@ -64,7 +65,7 @@ def test_nonsense_is_refused_in_one_sentence(make: Callable[[], Parameter], word
     assert str(raised.value).endswith(".") and "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "words"),
     [
         (lambda p: Camera("c", "c", "eucm", (9, 9), distortion=p), "c: distortion needs 2 numbers"),

@@ -11,10 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import specs_of, tolerance_of
+from tests.cases import each
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
-from icalib.estimate.inputs import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
 from icalib.model.sensor_model import own_entries
 from icalib.optim.state import make_layout
@@ -66,7 +67,7 @@ def tables(text: str) -> Iterator[tuple[int, set[str]]]:
             yield node.lineno, found
 
 
-@pytest.mark.parametrize(
+@each(
     "text", ['X = ("rotation", "translation", "bloom")', '{"radii": 2, "baseline": 1, "scales": 2}',
              'X = [("tilt", 1), ("shape", 2), ("size", 3)]']
 )  # fmt: skip
@@ -80,7 +81,7 @@ def test_no_table_lists_parameters_a_second_time():
     assert {path: listed for path, listed in found.items() if listed} == {}
 
 
-@pytest.mark.parametrize("kind", SENSOR_TYPES.values(), ids=SENSOR_TYPES)
+@each("kind", SENSOR_TYPES.values())
 def test_the_parameters_of_a_sensor_are_its_fields(kind: type[Sensor]):
     fields = {f.name for f in dataclasses.fields(kind) if f.type == "Parameter"}
     assert {spec.name for spec in kind.stated()} == fields
@@ -94,7 +95,7 @@ def test_kinds_that_share_a_name_share_its_definition():
     assert all(kind.sensor_type == name and kind.noun for name, kind in SENSOR_TYPES.items())
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.name)
+@each("sensor", SENSORS)
 def test_every_parameter_has_its_labels_and_a_tolerance(sensor: Sensor):
     for spec in sensor.specs():
         assert len(set(spec.labels)) == spec.size and spec.prior_sigma > 0.0
@@ -109,7 +110,7 @@ def drawn(spec: ParameterSpec) -> Parameter:
     return Parameter("prior", value, 0.01 + 0.1 * np.arange(spec.size))
 
 
-@pytest.mark.parametrize("sensor", SENSORS, ids=lambda s: s.name)
+@each("sensor", SENSORS)
 def test_every_parameter_goes_through_the_rig_file(sensor: Sensor):
     stated = [spec for spec in sensor.specs() if spec.name in {own.name for own in sensor.stated()}]
     sensor = dataclasses.replace(sensor, **{spec.name: drawn(spec) for spec in stated})

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from icalib.geometry.targets.boards import pattern_of
+from tests.cases import each
 
 from icalib.base.files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag, Target
-from icalib.geometry.targets.boards import pattern_of
 from icalib.tools.printing import PAPERS, target_pdf, write_target
 
 pytest.importorskip("reportlab")
@@ -51,7 +52,7 @@ def page(pdf: bytes) -> np.ndarray:
     return rows(rf"/MediaBox \[ 0 0 {NUMBER} {NUMBER} \]", pdf.decode("latin1"))[0]
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@each("name", TARGETS)
 def test_the_page_holds_the_pattern_at_true_scale(name: str):
     target, paper = TARGETS[name]
     pdf, pattern = target_pdf(target, paper), pattern_of(target)
@@ -79,7 +80,7 @@ def test_corners_of_an_aprilgrid_are_its_points():
         assert np.abs(ends - [left + x, bottom + y]).max(axis=1).min() < 2e-3
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@each("name", TARGETS)
 def test_the_ruler_is_100_mm_and_below_the_target(name: str):
     pdf = target_pdf(*TARGETS[name])
     lines = rows(rf"n {NUMBER} {NUMBER} m {NUMBER} {NUMBER} l S", stream(pdf))
@@ -141,7 +142,7 @@ def test_the_same_target_gives_the_same_file():
     assert target_pdf(*TARGETS["checkerboard"]) == target_pdf(*TARGETS["checkerboard"])
 
 
-@pytest.mark.parametrize(
+@each(
     ("target", "paper", "words"),
     [
         (
@@ -195,7 +196,7 @@ COMMANDS = {
 }
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@each("command", COMMANDS)
 def test_the_command_prints_each_target(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "board.pdf"
     assert main(["target", *command.split(), "--output", str(path)]) == 0
@@ -218,7 +219,7 @@ def test_the_command_refuses_in_one_line_and_writes_nothing(tmp_path: Path, caps
     assert error.startswith("icalib: the target is 500 x 350 mm") and error.count("\n") == 1 and not path.exists()
 
 
-@pytest.mark.parametrize(
+@each(
     ("arguments", "words"),
     [
         ("checkerboard --rows 0 --cols 9 --square-size 0.05 -o x.pdf", "must be at least 1"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import Measurements
 from icalib.errors import RigError
@@ -19,7 +20,7 @@ MOCAP, ODOMETRY = PoseSensor("mocap0", ""), PoseSensor("odom0", "", "relative")
 EMPTY = Measurements.of_streams()
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "sentence"),
     [
         (Rig(by_name(IMU)), "there is no camera, no LiDAR, no pose sensor and no position sensor"),
@@ -42,7 +43,6 @@ EMPTY = Measurements.of_streams()
         (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
         (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
     ],
-    ids=lambda value: "" if isinstance(value, Rig) else value,
 )
 def test_what_cannot_be_calibrated_is_refused(rig: Rig, sentence: str):
     with pytest.raises(RigError, match=sentence):
@@ -55,7 +55,7 @@ def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
     assert rig_from_dict(rig_to_dict(rig), "rig.yaml").reference == "cam0"
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "words"),
     [
         (Rig(by_name(IMU, ImuSensor("imu1", "", IMU.noise), LIDAR)), "^imu1 is a second IMU beside imu0"),
@@ -73,7 +73,7 @@ def test_rigs_made_in_python_are_checked_as_rig_files_are(rig: Rig, words: str):
         check_complete(rig)
 
 
-@pytest.mark.parametrize(
+@each(
     "rig",
     [Rig(by_name(IMU, LIDAR)), Rig(by_name(IMU, ODOMETRY)), Rig(by_name(WHEELS, MOCAP)), Rig(by_name(GNSS, MOCAP))],
 )

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.cases import each
 from tests.typed import instance, not_none
 
 from icalib.errors import CalibrationError, RigError
@@ -149,7 +150,7 @@ def test_units_axes_and_sources_of_an_imu(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
+@each(
     ("line", "words"),
     [
         ("accel_unit: mg", "there is no such unit as 'mg'"),
@@ -162,7 +163,7 @@ def test_wrong_units_axes_and_sources_of_an_imu(tmp_path, line, words):
     assert words in complaint(tmp_path, edited("    type: imu\n", f"    type: imu\n    {line}\n"))
 
 
-@pytest.mark.parametrize("name", IMU_CLASSES)
+@each("name", IMU_CLASSES)
 def test_imu_classes(tmp_path, name):
     noise = not_none(
         load(tmp_path, edited("{gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", name)).imu
@@ -174,7 +175,7 @@ def test_imu_classes(tmp_path, name):
 TURN = "{guess: [[0, -1, 0], [1, 0, 0], [0, 0, 1]]}"
 
 
-@pytest.mark.parametrize(
+@each(
     ("value", "expected"),
     [
         ("{xyzw: [0, 0, 0.70710678, 0.70710678]}", [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),
@@ -218,7 +219,7 @@ def test_free_imu_intrinsics_are_broad_priors(tmp_path):
     assert not_none(intrinsics.sigma).tolist() == [0.05] * 15 + [0.01] * 9
 
 
-@pytest.mark.parametrize(
+@each(
     ("noise", "name"),
     [
         *((name, name) for name in IMU_CLASSES),
@@ -257,10 +258,8 @@ def test_imu_intrinsics_with_own_values(tmp_path):
         assert (intrinsics.sigma if sigma is None else not_none(intrinsics.sigma).tolist()) == sigma
 
 
-@pytest.mark.parametrize("extra", ["", "    intrinsics: free\n", "    intrinsics: fixed\n"])
-@pytest.mark.parametrize(
-    "noise", ["noise: {gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", "path: i.csv"]
-)
+@each("extra", ["", "    intrinsics: free\n", "    intrinsics: fixed\n"])
+@each("noise", ["noise: {gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", "path: i.csv"])
 def test_plain_data_load_back_as_the_same_rig(tmp_path, extra, noise):
     text = edited("noise: {gyro: 1.7e-4, gyro_walk: 2e-5, accel: 2e-3, accel_walk: 3e-3}", noise)
     rig = load(tmp_path, text.replace("    type: imu\n", "    type: imu\n" + extra))
@@ -284,7 +283,7 @@ TARGET = "{type: aprilgrid, rows: 6, cols: 7, tag_size: 0.088, tag_spacing: 0.3}
 CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker_size: 0.03, dictionary: 5x5_100}"
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         (
@@ -464,15 +463,13 @@ def test_an_aprilgrid_of_plain_tags(tmp_path, border):
         load_rig(path)
 
 
-@pytest.mark.parametrize("text", ["", "# nothing\n", "---\n"])
+@each("text", ["", "# nothing\n", "---\n"])
 def test_empty_file(tmp_path, text):
     sentence = complaint(tmp_path, text)
     assert "is empty" in sentence
 
 
-@pytest.mark.parametrize(
-    "text", ["3", "[1, 2]", "a: 1\n---\nb: 2\n", "[" * 5000, "a: \x07", "a: !!python/object:os.x {}"]
-)
+@each("text", ["3", "[1, 2]", "a: 1\n---\nb: 2\n", "[" * 5000, "a: \x07", "a: !!python/object:os.x {}"])
 def test_not_a_rig_at_all(tmp_path, text):
     complaint(tmp_path, text)
 
@@ -506,7 +503,7 @@ def mutated(text: str, rng: random.Random) -> str:
     return " ".join(words)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@each("seed", range(10))
 def test_no_mutation_escapes_as_another_error(tmp_path, seed):
     rng = random.Random(seed)
     refused = 0

@@ -1,6 +1,7 @@
 """The magnitude of gravity in the rig file: exact, with a prior, or from a place."""
 
 import pytest
+from tests.cases import each
 
 from icalib.base.yaml_nodes import parse_yaml
 from icalib.errors import RigError
@@ -21,7 +22,7 @@ def test_a_prior_comes_back():
 
 
 # Gravity at sea level: WGS84's own at equator and poles; gravimeters in Zurich (408 m) and Quito (2850 m).
-@pytest.mark.parametrize(
+@each(
     ("latitude", "height", "expected", "within"),
     [
         (0.0, 0.0, 9.7803253, 1e-7),
@@ -35,7 +36,7 @@ def test_latitude_and_height_give_gravity(latitude, height, expected, within):
     assert parsed(f"{{latitude: {latitude}, height: {height}}}") == gravity_at(latitude, height)
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [
         ("-9.81", "gravity"),

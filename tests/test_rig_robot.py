@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import RigError
@@ -206,7 +207,7 @@ def test_plain_lidars_and_wheels_load_back(tmp_path):
             assert repr(p) == repr(q), one.name
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("range_noise: 0.02", "range_noise: 0", "rig.yaml:5: sensors.lidar0.range_noise: must be above 0"),
@@ -324,7 +325,7 @@ def test_kinds_of_wheels_are_read_and_load_back(tmp_path):
         assert all(repr(getattr(a, f.name)) == repr(getattr(b, f.name)) for f in dataclasses.fields(a))
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         (

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import (
     CornerStream,
@@ -58,7 +59,7 @@ def test_streams_come_in_the_order_of_the_rig():
     assert (found.imu, found.wheels, found.poses) == (WHOLE.imu, WHOLE.wheels, WHOLE.poses)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "measured", "words"),
     [
         (RIG, WHOLE.without("imu0"), "drive has no data of imu0"),
@@ -86,7 +87,7 @@ def test_a_sensor_has_one_stream_of_a_kind_but_a_camera_corners_and_tracks():
         Measurements.of_streams(lidar("front"), lidar("rear"), lidar("front"), name="drive")
 
 
-@pytest.mark.parametrize("far", [[465_875.0, 5_248_232.0, 413.0], [-7e6, 0.0, 0.0], [0.0, 50.0, 0.0]])
+@each("far", [[465_875.0, 5_248_232.0, 413.0], [-7e6, 0.0, 0.0], [0.0, 50.0, 0.0]])
 def test_positions_far_from_their_origin_get_a_near_one_with_all_sensors_of_the_frame(far):
     """No digit is lost: the new origin and a new position add up to the old one exactly."""
     position = far + np.random.default_rng(0).normal(size=(9, 3))

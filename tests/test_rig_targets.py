@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
@@ -32,7 +33,7 @@ def written(tmp_path: Path):
     return write
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "target"),
     [
         (f"target: {TAGS}", MARKERS),
@@ -66,7 +67,7 @@ def test_a_file_of_targets_alone_is_read(tmp_path: Path):
         assert load_target(tmp_path / "target.yaml") == MARKERS
 
 
-@pytest.mark.parametrize("spelling", ["apriltag_36h11", "DICT_APRILTAG_36h11", "36h11", "Tag36h11"])
+@each("spelling", ["apriltag_36h11", "DICT_APRILTAG_36h11", "36h11", "Tag36h11"])
 def test_spellings_of_a_family_are_one(written, spelling: str):
     assert load_rig(written(f"target: {TAGS.replace('tag36h11', spelling)}")).target == MARKERS
     board = load_rig(written(f"target: {CHARUCO.replace('5x5_100', spelling)}")).target
@@ -78,7 +79,7 @@ LARGER = CHARUCO.replace("5x5_100", "5x5_1000")
 ONE_BIT = GRID.replace("}", ", border_bits: 1}")
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "words"),
     [
         ("", "rig.yaml:1: target is missing; add target, targets for several by name, or tracks"),
@@ -123,7 +124,7 @@ def test_what_is_wrong_is_named(written, text: str, words: str):
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     "others",
     [
         {"a": CHARUCO, "b": "{type: markers, family: 5x5_250, size: 0.1, ids: [17]}"},

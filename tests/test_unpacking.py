@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.base.extras import load_lz4, load_zstd
 from icalib.base.files import FREE_BYTES, TooLargeError, gunzipped, load_arrays, unpacked
@@ -64,7 +65,7 @@ def archive(name: str, header: str, data: bytes = b"") -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize(
+@each(
     "header",
     [
         "{'descr': '<f8', 'fortran_order': False, 'shape': (137438953472,)}",
@@ -80,7 +81,7 @@ def test_headers_of_arrays_that_lie(header: str):
         load_arrays(archive("a", header, bytes(8)))
 
 
-@pytest.mark.parametrize("plane", [2**31, 2**31 - 1, -2, 5])
+@each("plane", [2**31, 2**31 - 1, -2, 5])
 def test_plane_ids_are_below_the_number_of_points(tmp_path: Path, plane: int):
     arrays = {
         "stamps_ns": np.arange(2) * 100_000_000,

@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from icalib.tools.simulation.motion import read_imu
+from tests.cases import each
 
 from icalib.cli import main
 from icalib.data.measurements import ImuStream
@@ -235,7 +237,7 @@ def touched(imu: ImuStream, at_s: float, tilt: float) -> ImuStream:
     return with_readings(imu, readings)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
+@each("seed", [0, 1, 2])
 def test_what_was_touched_is_left_out(seed: int):
     imu = touched(touched(at_rest(60.0, 100.0, seed), 20.3, 0.05), 38.9, -0.02)
     study = study_imu(imu, "here")
@@ -296,7 +298,7 @@ def test_one_stretch_alone_is_what_it_was():
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize("rate", [12.0, 25.0, 400.0])
+@each("rate", [12.0, 25.0, 400.0])
 def test_noise_that_scatters_is_no_motion(rate: float):
     """Few readings a second, or many through a filter of 4 Hz: the noise of a second scatters by a fifth."""
     imu = at_rest(4000.0 if rate < 400.0 else 600.0, rate, 5)
@@ -541,7 +543,7 @@ def test_a_bag_gives_what_its_table_gives(tmp_path: Path, form: BagForm):
         study_recording(bag)
 
 
-@pytest.mark.parametrize(("axis", "name"), [(0, "gyroscope x"), (5, "accelerometer z"), (slice(None), "gyroscope x")])
+@each(("axis", "name"), [(0, "gyroscope x"), (5, "accelerometer z"), (slice(None), "gyroscope x")])
 def test_an_axis_that_never_changes(axis, name: str):
     readings = np.concatenate([(imu := at_rest(20.0, 100.0, 3)).gyro, imu.accel], axis=1)
     readings[:, axis] = 0.25

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from tests.cases import each
 
 from icalib.base.extras import load_distributed
 from icalib.errors import CalibrationError
@@ -25,7 +26,7 @@ def test_a_task_that_kills_its_workers_is_given_up_and_takes_no_other_with_it():
     }
 
 
-@pytest.mark.parametrize("error", [OSError("closed"), TimeoutError("late"), load_distributed().CancelledError("gone")])
+@each("error", [OSError("closed"), TimeoutError("late"), load_distributed().CancelledError("gone")])
 def test_an_answer_that_never_comes_is_a_scheduler_that_went_away(error: BaseException):
     class Future:
         def exception(self) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.detection import AprilGridDetector, CharucoDetector, CheckerboardDetector, MarkerDetector
 
@@ -66,19 +67,21 @@ TARGETS = {
         ALL | {"cut": 0.5},
     ),
 }
-IMAGES = 2
 CROWDED_SIGMA_PX = 0.035  # of corners so near to the bits of their tag that these may move them
 
 
-@pytest.mark.parametrize("pose", POSES)
-@pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.parametrize("blur", [0.7, 1.2])
-def test_corners_are_right(rendering, target, pose, blur):
+@each("pose", POSES)
+@each("target", TARGETS)
+@pytest.mark.parametrize(
+    ("blur", "images"),
+    [(0.7, 1), pytest.param(0.7, 2, marks=pytest.mark.full), pytest.param(1.2, 2, marks=pytest.mark.full)],
+)
+def test_corners_are_right(rendering, target, pose, blur, images):
     (kind, *arguments), detector, y_up, least = TARGETS[target]
     pattern = getattr(rendering, kind)(*arguments)
     distance, tilt, turn, roll, offset = POSES[pose]
     uv, inward, visible = [], [], 0
-    for seed in range(IMAGES):
+    for seed in range(images):
         H = rendering.homography(pattern, distance, tilt, turn, roll + 7.0 * seed, offset, y_up)
         found = detector.detect(rendering.render(pattern, H, blur, noise=2.0, seed=seed))
         assert len(np.unique(found.point)) == len(found.point)
@@ -99,10 +102,8 @@ def test_corners_are_right(rendering, target, pose, blur):
         assert np.abs(uv.mean(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize(
-    ("family", "side"), [("APRILTAG_36H11", 18), ("APRILTAG_36H11", 20), ("4X4_50", 14), ("4X4_50", 17)]
-)
-@pytest.mark.parametrize("blur", [0.6, 0.8])
+@each(("family", "side"), [("APRILTAG_36H11", 18), ("APRILTAG_36H11", 20), ("4X4_50", 14), ("4X4_50", 17)])
+@each("blur", [0.6, 0.8])
 def test_small_tags_are_kept_with_a_sigma_that_is_right(rendering, family, side, blur):
     """Sides [px] for which the bits are too near to the edges: their errors are larger, and so is their sigma."""
     ids = (1, 5, 9)

@@ -7,17 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-from icalib.data.measurements import CornerStream, Measurements
 from icalib.detection.decoding import corner_stream
 from icalib.detection.detectors import detector_of
+from icalib.sensors.camera.corner_bias import ellipse_shift
+from tests.cases import each
+
+from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Checkerboard, Circles, Scene
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig.file import load_rig, load_target
-from icalib.sensors.camera.corner_bias import ellipse_shift
 from icalib.tools.inspection import read_target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera
@@ -56,8 +57,8 @@ def poses(target: Circles, camera: SimCamera, seed: int, count: int) -> list[np.
     return views
 
 
-@pytest.mark.parametrize("camera", [PINHOLE, FISHEYE], ids=lambda c: c.model)
-@pytest.mark.parametrize("target", [SYMMETRIC, ASYMMETRIC], ids=["symmetric", "asymmetric"])
+@each("camera", [PINHOLE, FISHEYE])
+@each("target", [SYMMETRIC, ASYMMETRIC])
 def test_centres_are_those_of_the_projected_circles(camera, target):
     """Each under its number, and away from the projection of its centre as perspective and lens say."""
     renderer, detector = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)), detector_of(target)
@@ -99,7 +100,7 @@ NEAR = [
 ]
 
 
-@pytest.mark.parametrize(("camera", "target", "view"), NEAR)
+@each(("camera", "target", "view"), NEAR)
 def test_a_grid_is_found_from_very_near(camera, target, view):
     """Neighbouring circles differ in size by up to a half, and the grid fills up to 140 degrees."""
     picture = Renderer(camera, Imaging(blur_px=0.8, noise=2.0)).picture(
@@ -167,7 +168,7 @@ def calibrated(target: Circles, camera: SimCamera, stream: CornerStream, folder:
     return calibrate_measurements(load_rig(folder / "rig.yaml"), Measurements.of_streams(stream))
 
 
-@pytest.mark.parametrize(
+@each(
     ("target", "turns"),
     [(SYMMETRIC, 2), (Circles(6, 6, 0.04, 0.02), 4), (ASYMMETRIC, 1), (Circles(4, 5, 0.03, 0.02, True), 2)],
 )

@@ -6,6 +6,11 @@ import importlib
 
 import numpy as np
 import pytest
+from icalib.detection.decoding import with_verdicts
+from icalib.detection.detectors import detector_of
+from icalib.detection.tags import tag_family
+from icalib.geometry.targets.boards import pattern_of
+from tests.cases import each
 
 from icalib.base.extras import load_cv2
 from icalib.detection import (
@@ -17,9 +22,6 @@ from icalib.detection import (
     MarkerDetector,
     corner_stream,
 )
-from icalib.detection.decoding import with_verdicts
-from icalib.detection.detectors import detector_of
-from icalib.detection.tags import tag_family
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.boards import pattern_of
@@ -73,7 +75,7 @@ def test_a_tag_that_is_hidden_is_left_out(rendering):
     assert set(range(36)) - set(found.point[found.kept] // 4) == {14}
 
 
-@pytest.mark.parametrize(
+@each(
     "detector",
     [
         AprilGridDetector(6, 6, 0.3),
@@ -146,7 +148,7 @@ def test_a_symmetric_checkerboard_runs_to_the_right(rendering):
         np.testing.assert_allclose(found.uv, rendering.applied(H, pattern.points)[found.point], atol=0.1)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "sentence"),
     [
         (lambda: AprilGridDetector(30, 30, 0.3), r"30 x 30 tags needs more ids than tag36h11 has \(587\); check rows"),
@@ -184,7 +186,7 @@ def test_a_family_that_an_old_opencv_lacks_is_refused(monkeypatch):
         opencv_bits("aruco_mip_36h12")
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@each("name", FAMILIES)
 def test_families_are_read_from_opencv(name):
     family = tag_family(name)
     assert family.codes.shape[1] == 4 and 4 <= family.bits <= 7

@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.detection import what_is_seen
 
@@ -21,7 +22,7 @@ def scene(rendering):
     return image
 
 
-@pytest.mark.parametrize(
+@each(
     ("pattern", "target", "sentence"),
     [
         (

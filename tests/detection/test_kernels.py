@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
-from scipy.optimize import least_squares
-from scipy.special import erf
-
 from icalib.detection.decoding import bilinear, lookup, mapped, popcount, read_cells, unit_homography, visible_cells
 from icalib.detection.edge_model import fit_corners, fit_step, solve_small
 from icalib.detection.growth import consistent_corners, fit_homography, largest_group
 from icalib.detection.saddles import fit_crossing
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
+from scipy.special import erf
+from tests.cases import each
 
 H_TRUE = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.02, -0.03, 1.0]])
 
@@ -65,7 +65,7 @@ def test_read_cells_packs_row_by_row_and_counts_a_white_border():
     assert visible_cells(grey, 1) == 0b0111
 
 
-@pytest.mark.parametrize("side", [20.0, 30.0, 50.0])
+@each("side", [20.0, 30.0, 50.0])
 def test_fit_step_is_the_least_squares_fit(side):
     normal = np.array([np.sin(0.3), -np.cos(0.3)])  # outward, for a side that runs along (cos, sin)
     along = np.array([np.cos(0.3), np.sin(0.3)])
@@ -177,8 +177,8 @@ FINE_V, FINE_U = (np.indices((480, 480)) + 0.5) / 8.0 - 0.5
 CURVATURES = [(0.004, 0.0), (0.0, -0.004), (-0.003, 0.005)]  # 1 / px: of a lens that bends much
 
 
-@pytest.mark.parametrize("curvature", CURVATURES)
-@pytest.mark.parametrize("turned", [False, True])
+@each("curvature", CURVATURES)
+@each("turned", [False, True])
 def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, turned):
     ea, eb, corner = np.array([30.0, 6.0]), np.array([-4.0, 28.0]), np.array([30.3, 29.6])
     la = bent_distance(FINE_U, FINE_V, corner, ea, curvature[0])
@@ -198,8 +198,8 @@ def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, t
         np.testing.assert_array_equal(edge[:2], -edge[2:4])
 
 
-@pytest.mark.parametrize("curvature", CURVATURES)
-@pytest.mark.parametrize("length", [18.0, 36.0])
+@each("curvature", CURVATURES)
+@each("length", [18.0, 36.0])
 def test_corners_of_a_quad_move_to_their_places_where_curvatures_are_known(curvature, length):
     """Short sides are fitted as straight ones, long ones with a bend, and noise makes the fitted bend another one."""
     quad = 30.0 + length * (np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)]) - 0.5) + 0.2
@@ -244,7 +244,7 @@ def grid(noise=0.05):
     return xy, uv + noise * np.random.default_rng(5).standard_normal(uv.shape)
 
 
-@pytest.mark.parametrize("row", [0, 14, 35])
+@each("row", [0, 14, 35])
 def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
     xy, uv = grid()
     found, side = np.ones(36, dtype=bool), np.full(36, 30.0)
@@ -253,8 +253,8 @@ def test_a_corner_that_is_off_is_inconsistent_and_no_other(row):
     np.testing.assert_array_equal(np.flatnonzero(~consistent_corners(uv, xy, found, side, (480, 752))), [row])
 
 
-@pytest.mark.parametrize("focal", [120.0, 200.0, 320.0])
-@pytest.mark.parametrize("row", [0, 14, 77])
+@each("focal", [120.0, 200.0, 320.0])
+@each("row", [0, 14, 77])
 def test_a_fisheye_bends_a_board_without_making_corners_inconsistent(focal, row):
     """An equidistant lens that sees the board from near, to 83 degrees from its axis."""
     xy = np.stack(np.meshgrid(np.arange(11.0), np.arange(7.0)), axis=-1).reshape(-1, 2)

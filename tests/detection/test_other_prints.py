@@ -7,12 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from icalib.detection.detectors import detector_of, other_columns, other_size, with_other_layout
+from icalib.geometry.targets.boards import pattern_of
+from tests.cases import each
 
 from icalib.detection import what_is_seen
-from icalib.detection.detectors import detector_of, other_columns, other_size, with_other_layout
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
-from icalib.geometry.targets.boards import pattern_of
 from icalib.rig.file import load_target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera
@@ -114,7 +115,7 @@ def test_the_wrong_layout_is_named(legacy):
     assert with_other_layout([image], replace(board, squares_y=7)) == ""  # the layouts are one
 
 
-@pytest.mark.parametrize(
+@each(
     ("board", "wrong", "words"),
     [
         (
@@ -135,7 +136,7 @@ def test_swapped_and_wrong_rows_of_tags_are_named(board, wrong, words):
     assert words in other_columns([image], replace(board, **wrong))
 
 
-@pytest.mark.parametrize(
+@each(
     ("board", "wrong"),
     [
         (AprilGrid(2, 30, 0.05, 0.3), {"cols": 29}),
@@ -160,7 +161,7 @@ def test_no_layout_is_named_that_the_tags_in_sight_do_not_tell_from_others():
     assert sentence == "the layout of the tags does not match cols: 5; correct rows and cols."
 
 
-@pytest.mark.parametrize(("rows", "cols"), [(6, 9), (9, 6), (5, 7)])
+@pytest.mark.parametrize(("rows", "cols"), [(6, 9), (5, 7), pytest.param(9, 6, marks=pytest.mark.full)])
 def test_counted_squares_are_named(rows, cols):
     image = rendered(Checkerboard(rows, cols, 0.035))
     sentence = other_size([image], Checkerboard(rows + 1, cols + 1, 0.035))
@@ -173,7 +174,7 @@ def test_counted_squares_are_named(rows, cols):
     assert other_size([image, rendered(GRID), rendered(GRID)], Checkerboard(rows + 3, cols + 1, 0.035)) == ""
 
 
-@pytest.mark.parametrize("board", [CHARUCO, replace(CHARUCO, legacy=True), Checkerboard(6, 7, 0.04)])
+@each("board", [CHARUCO, replace(CHARUCO, legacy=True), Checkerboard(6, 7, 0.04)])
 def test_white_on_black(board):
     inverted = replace(board, inverted=True)
     image = rendered(inverted)
@@ -187,7 +188,7 @@ def test_white_on_black(board):
         assert "white on black; set inverted: true" in what_is_seen([image], "4x4_50", 1, range(24))
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "target"),
     [
         ("{type: aprilgrid, rows: 3, cols: 4, tag_size: 0.05, tag_spacing: 0.3, first_id: 36, family: 36h10}", GRID),

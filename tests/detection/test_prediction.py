@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
-from tests.typed import instance
-
 from icalib.detection.decoding import ImageCorners, mapped, no_corners
 from icalib.detection.detectors import _Detector, _Follower, detector_of
 from icalib.detection.growth import PredictedCorners, predict_corners, predict_nodes
 from icalib.detection.tags import ImageWithQuads
+from tests.cases import each
+from tests.typed import instance
+
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles
 from icalib.tools.simulation import HandheldMotion, film, handheld
 
@@ -71,16 +73,18 @@ def test_nodes_that_were_not_seen_lie_on_the_board():
     np.testing.assert_allclose(predict_nodes(every[seen], true[seen], 5, 7).reshape(-1, 2), true, atol=1e-6)
 
 
-def filmed(target, count):
-    base = handheld(count / 20.0 + 0.3)
+@cache
+def filmed(name):
+    """Seven images of a target, 50 ms apart."""
+    base = handheld(0.65)
     motion = HandheldMotion(rotation_scale=0.5, translation_scale=0.5, seed=1)
-    run = film(replace(base, target=target, motion=motion, cameras=(base.cameras[0],)), 0)
-    return [shot.pixels for shot in run.shots()][:count]
+    run = film(replace(base, target=TARGETS[name], motion=motion, cameras=(base.cameras[0],)), 0)
+    return [shot.pixels for shot in run.shots()][:7]
 
 
-@pytest.mark.parametrize("name", TARGETS)
+@each("name", TARGETS)
 def test_what_is_found_near_is_what_a_search_of_the_whole_image_finds(name, monkeypatch):
-    detector, images = detector_of(TARGETS[name]), filmed(TARGETS[name], 7)
+    detector, images = detector_of(TARGETS[name]), filmed(name)
     whole = [detector.detect(image) for image in images]
     kind = type(instance(detector, _Detector).finder)
     searched, plain = [], kind.find
@@ -98,9 +102,9 @@ def test_what_is_found_near_is_what_a_search_of_the_whole_image_finds(name, monk
         assert np.sqrt((apart**2).mean()) < 2e-4 and np.quantile(apart, 0.99) < 1e-3
 
 
-@pytest.mark.parametrize("name", ["grid", "charuco", "checkerboard"])
+@each("name", ["grid", "charuco", "checkerboard"])
 def test_a_target_that_jumped_is_searched_for(name):
-    detector, images = detector_of(TARGETS[name]), filmed(TARGETS[name], 3)
+    detector, images = detector_of(TARGETS[name]), filmed(name)[:3]
     before = [detector.detect(image) for image in images[:2]]
     for moved in (np.roll(images[2], 60, axis=1), np.full_like(images[2], 128)):
         a, b = detector.detect(moved), detector.detect(moved, before)
@@ -108,11 +112,11 @@ def test_a_target_that_jumped_is_searched_for(name):
         np.testing.assert_array_equal(a.uv, b.uv)
 
 
-@pytest.mark.parametrize("name", ["charuco", "checkerboard"])
-@pytest.mark.parametrize("squares", [(2, 0), (0, 2), (1, 1)])
+@each("name", ["charuco", "checkerboard"])
+@each("squares", [(2, 0), (0, 2), (1, 1)])
 def test_a_board_is_not_taken_for_one_that_is_some_squares_away(name, squares):
     """Where it is expected, its squares look right."""
-    detector, (image,) = detector_of(TARGETS[name]), filmed(TARGETS[name], 1)
+    detector, image = detector_of(TARGETS[name]), filmed(name)[0]
     found, cols = detector.detect(image), {"charuco": 5, "checkerboard": 9}[name]
     at = np.stack(np.divmod(found.point, cols), axis=1)
     rows = at.max(axis=0)[0] + 1

@@ -8,12 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from icalib.detection.decoding import ImageCorners, no_corners
+from icalib.detection.detectors import detector_of
+from tests.cases import each
 from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection import tags as quads
-from icalib.detection.decoding import ImageCorners, no_corners
-from icalib.detection.detectors import detector_of
 from icalib.detection.images import sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
@@ -83,7 +84,7 @@ def test_corners_of_a_tag_map_with_a_grid_are_where_they_are(shots: list[Shot]):
         assert abs(inside[rows].mean()) < 0.02 and np.abs(uv[rows].mean(axis=0)).max() < 0.02
 
 
-@pytest.mark.parametrize(("family", "size"), [("tag36h11", 0.1), ("tag36h11", 0.15), ("4x4_50", 0.08)])
+@each(("family", "size"), [("tag36h11", 0.1), ("tag36h11", 0.15), ("4x4_50", 0.08)])
 def test_small_and_oblique_tags(family: str, size: float):
     """Tags of 26 to 50 px in a row, turned about the vertical by up to 70 degrees; the lens bends their sides."""
     angles = np.radians([0.0, 30.0, 50.0, 60.0, 70.0])
@@ -144,8 +145,8 @@ def test_sentences_on_a_scene(shots: list[Shot]):
     _, notes = found_in(images, Scene(("wall", "board"), (TAGS, board)))
     assert notes[1:] == ("shown.bag /cam0: board is never seen; check its type, family, ids and sizes.",)
     none = Scene(("board", "charuco"), (board, Charuco(5, 4, 0.05, 0.04, "4x4_50")))
-    with pytest.raises(RecordingError, match=r"board and charuco are in none of 8 images of cam0; the images show \d+"):
-        found_in(images, none)
+    with pytest.raises(RecordingError, match=r"board and charuco are in none of 2 images of cam0; the images show \d+"):
+        found_in(images[:2], none)
 
 
 @pytest.mark.parametrize(("true", "stated"), [(2, 1), (1, 2)])
@@ -154,7 +155,7 @@ def test_a_border_of_the_other_width_is_named(true: int, stated: int):
     grids = {bits: AprilGrid(6, 6, 0.088, 0.3, bits) for bits in (1, 2)}
     camera = replace(scenario.cameras[0], rate_hz=5.0)
     recording = film(replace(scenario, cameras=(camera,), target=grids[true]), 0)
-    images = [shot.pixels for shot in recording.shots()]
+    images = [shot.pixels for shot in recording.shots()][:6]
     says = rf"\d+ tags of tag36h11 \(ids 0 to 35\) with border_bits {true}, not {stated}; correct border_bits"
     with pytest.raises(RecordingError, match=says) as caught:
         found_in(images, grids[stated])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
 from icalib.detection.checkerboard import shows_grid
 from icalib.detection.detectors import detector_of, other_size
+from tests.cases import each
+
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Target
 
 SIDES = (1, 2, 7, 10, 11, 12, 14, 15, 16, 23, 24)
@@ -28,14 +28,14 @@ def images(side: int) -> list[np.ndarray]:
     return [rng.integers(0, high, shape, dtype=np.uint8) for shape in shapes for high in (1, 256)]
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS)
-@pytest.mark.parametrize("side", SIDES)
+@each("target", TARGETS.values())
+@each("side", SIDES)
 def test_no_target_is_found(side: int, target: Target):
     for image in images(side):
         assert not len(detector_of(target).detect(image).point)
 
 
-@pytest.mark.parametrize("side", SIDES)
+@each("side", SIDES)
 def test_neither_a_grid_nor_a_board_of_another_size_is_found(side: int):
     assert not any(shows_grid(image, 5) for image in images(side))
     assert other_size(images(side)[:2], Checkerboard(6, 7, 0.03)) == ""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
-
 from icalib.detection.detectors import detector_of
+from tests.cases import each
+
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera
@@ -22,8 +22,8 @@ TARGETS: dict[str, tuple[Target, float, float]] = {  # distance of the camera [m
 }
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("name", TARGETS)
+@each("camera", CAMERAS)
+@each("name", TARGETS)
 def test_corners_of_a_board_seen_from_near_are_kept(camera, name):
     target, distance, least = TARGETS[name]
     a, low, high = np.radians(15.0), target.points.min(axis=0), target.points.max(axis=0)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.optim.anderson import Accelerator
 
 
-@pytest.mark.parametrize("rates", [(0.2, 1.8), (0.3, 0.6), (1.5, 1.7)])
+@each("rates", [(0.2, 1.8), (0.3, 0.6), (1.5, 1.7)])
 def test_two_modes_are_solved_by_the_third_step(rates):
     """Of the map x -> x + A (end - x), A with two eigenvalues `rates`, in a space of 16 numbers in several units."""
     rng = np.random.default_rng(0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.optim import arrowhead
 from icalib.optim.arrowhead import (
@@ -64,8 +65,8 @@ def flat(solution):
     return np.concatenate([solution.chain.ravel(), solution.calib])
 
 
-@pytest.mark.parametrize("n_calib", [0, 1, 3, 8])
-@pytest.mark.parametrize("n_keyframes", range(1, 13))
+@each("n_calib", [0, 1, 3, 8])
+@each("n_keyframes", range(1, 13))
 def test_solution_is_the_dense_one(dense, n_keyframes, n_calib):
     pieces = random_pieces(n_keyframes, n_calib)
     H, g = dense(pieces, n_keyframes)
@@ -77,8 +78,8 @@ def test_solution_is_the_dense_one(dense, n_keyframes, n_calib):
     assert solution.decrease == pytest.approx(-(g @ step + 0.5 * step @ H @ step), rel=1e-10)
 
 
-@pytest.mark.parametrize("n_keyframes", [1, 3, 4, 7])
-@pytest.mark.parametrize("damping", [1e-9, 1e-2, 10.0])
+@each("n_keyframes", [1, 3, 4, 7])
+@each("damping", [1e-9, 1e-2, 10.0])
 def test_damping_scales_the_whole_diagonal(dense, n_keyframes, damping):
     pieces = random_pieces(n_keyframes, 4, seed=1)
     H, g = dense(pieces, n_keyframes)
@@ -102,7 +103,7 @@ def test_long_chain_is_cut_into_two_pieces_that_share_a_keyframe():
     assert [(p.first, p.last) for p in make_pieces(3, 2)] == [(0, 2)]
 
 
-@pytest.mark.parametrize("n_keyframes", [1, 2, 3])
+@each("n_keyframes", [1, 2, 3])
 def test_marginalise_is_the_schur_complement(dense, n_keyframes):
     (piece,) = random_pieces(n_keyframes, 5, seed=2)
     H, g = dense((piece,), n_keyframes)
@@ -134,8 +135,8 @@ def whole_and_segments(n_keyframes, n_calib, seed):
     return part(0, n_keyframes - 1), part
 
 
-@pytest.mark.parametrize("segment", [1, 2, 3, 100])
-@pytest.mark.parametrize("n_keyframes", [1, 2, 3, 4, 6, 7, 8])
+@each("segment", [1, 2, 3, 100])
+@each("n_keyframes", [1, 2, 3, 4, 6, 7, 8])
 def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n_keyframes, segment):
     monkeypatch.setattr(arrowhead, "SEGMENT_KEYFRAMES", segment)
     whole, part = whole_and_segments(n_keyframes, 5, seed=4)
@@ -146,7 +147,7 @@ def test_marginalising_in_segments_is_the_schur_complement(monkeypatch, dense, n
     np.testing.assert_allclose(calib[:-1, -1], gradient, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("keyframe", [0, 2, 3, 6])
+@each("keyframe", [0, 2, 3, 6])
 def test_marginalising_in_segments_raises_where_a_keyframe_is_not_determined(monkeypatch, keyframe):
     monkeypatch.setattr(arrowhead, "SEGMENT_KEYFRAMES", 3)
     _, part = whole_and_segments(7, 2, seed=4)
@@ -215,7 +216,7 @@ def test_a_direction_that_only_the_prior_of_a_nuisance_parameter_bounds_moves():
     assert fixed[0] == 0.0 and fixed[1] == pytest.approx(-gradient[1] / information[1, 1])
 
 
-@pytest.mark.parametrize("keyframe", [0, 4, 8])
+@each("keyframe", [0, 4, 8])
 def test_a_keyframe_that_nothing_determines_is_an_error(keyframe):
     pieces = random_pieces(9, 2)
     for piece in pieces:

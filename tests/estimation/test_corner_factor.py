@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.projection import project
 from scipy.optimize import minimize
+from tests.cases import each
 
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.sensors.camera.corner_factor import CornerNoise
-from icalib.tools.simulation.projection import project
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +35,8 @@ def noisy(factor, seed=0, size=1.0):
     return replace(factor, stream=replace(factor.stream, uv=uv))
 
 
-@pytest.mark.parametrize("split", [False, True], ids=["one body", "three bodies"])
-@pytest.mark.parametrize("camera", [0, 1], ids=["radtan", "equidistant"])
+@each("split", [False, True])
+@each("camera", [0, 1])
 def test_residual_is_the_obvious_formula_at_the_true_motion(unlike, setup_of, factor_of, camera, split):
     """Board, bloom and camera other than the truth; the IMU where it truly was, 5 ms later, on a stamp of the IMU."""
     setup = setup_of(unlike, split=split, shape=True)
@@ -75,7 +76,7 @@ def test_at_the_truth_nothing_is_left_between_keyframes_and_at_them(setup, facto
         assert cost < 1e-9
 
 
-@pytest.mark.parametrize("scheme", ["inertial", "kinematic", "pose"])
+@each("scheme", ["inertial", "kinematic", "pose"])
 def test_the_lever_arm_turns_with_the_imu(setup, factor_of, scheme):
     factor = factor_of(setup, 1, scheme)
     values = setup.state.values | {("cam1", "time_offset"): setup.state.values["cam1", "time_offset"] + 7e-3}
@@ -108,7 +109,7 @@ def losses(loss, scale, t):
     return 1.0 / (1.0 + (t / scale) ** 2), scale**2 / 2 * np.log(1.0 + (t / scale) ** 2)
 
 
-@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
+@each("loss", ["none", "huber", "cauchy"])
 def test_weights_and_cost(setup, factor_of, loss):
     factor = noisy(factor_of(setup, 0))
     sigma = np.random.default_rng(2).uniform(0.3, 1.5, len(factor.stream.uv))
@@ -121,8 +122,8 @@ def test_weights_and_cost(setup, factor_of, loss):
     assert cost == pytest.approx(each.sum(), rel=1e-12)
 
 
-@pytest.mark.parametrize(("loss", "tolerance"), [("none", 1e-9), ("huber", 1e-3), ("cauchy", 1e-3)])
-@pytest.mark.parametrize("m", [1, 3])
+@each(("loss", "tolerance"), [("none", 1e-9), ("huber", 1e-3), ("cauchy", 1e-3)])
+@each("m", [1, 3])
 def test_the_common_error_is_the_one_that_explains_the_image_best(setup, factor_of, loss, tolerance, m):
     factor = noisy(factor_of(setup, 0), size=0.6)
     n, rng, tau = len(factor.stream.uv), np.random.default_rng(3), np.array([0.7, 0.5, 0.3])[:m]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import CornerStream
 from icalib.sensors.camera.corner_noise import lens_misfit
@@ -23,7 +24,7 @@ def bent(uv: np.ndarray) -> np.ndarray:
     return 0.3 * np.sqrt(2.0) * np.stack([np.sin(2.0 * np.pi * x), np.cos(2.0 * np.pi * y)], axis=1)
 
 
-@pytest.mark.parametrize("images", [6, 40, 300])
+@each("images", [6, 40, 300])
 def test_noise_and_what_single_images_share_are_no_misfit(images: int):
     for seed in range(10):
         rng = np.random.default_rng(seed)

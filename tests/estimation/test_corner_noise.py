@@ -6,10 +6,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import Inputs
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.inputs import Inputs
 from icalib.geometry.cameras import camera_model
 from icalib.model.sensor_model import Fit
 from icalib.rig import Camera, Settings
@@ -27,8 +28,8 @@ from icalib.sensors.camera.corner_noise import (
 BASE, EXPOSURE_S = 0.08, 4e-4
 
 
-@pytest.mark.parametrize("blurred", [False, True])
-@pytest.mark.parametrize("stated", [False, True])
+@each("blurred", [False, True])
+@each("stated", [False, True])
 def test_the_size_of_the_noise_is_found(unlike, setup_of, factor_of, stated, blurred):
     setup = setup_of(unlike)
     factor, rng = factor_of(setup, 0), np.random.default_rng(5)
@@ -51,8 +52,8 @@ def test_the_size_of_the_noise_is_found(unlike, setup_of, factor_of, stated, blu
     np.testing.assert_allclose(noise.sigma, true, rtol=1e-12)
 
 
-@pytest.mark.parametrize("stated", [False, True])
-@pytest.mark.parametrize(("size", "large"), [(1.0, True), (0.0, False)])
+@each("stated", [False, True])
+@each(("size", "large"), [(1.0, True), (0.0, False)])
 def test_a_large_misfit_is_large_for_the_loss_and_for_the_warning(
     unlike, setup_of, factor_of, monkeypatch, size, large, stated
 ):
@@ -99,7 +100,7 @@ def test_images_that_see_the_misfit_are_in_both_halves(unlike, setup_of, factor_
         assert sum(len(np.unique(factor.stream.image[half])) for half in halves) == min(most, images)
 
 
-@pytest.mark.parametrize(
+@each(
     ("places", "words"),
     [
         ([(740, 10)], "top right corner"),
@@ -115,7 +116,7 @@ def test_the_region_of_the_misfit_is_named(places, words):
     assert lenses.worst_regions(uv, field, (752, 480)) == words
 
 
-@pytest.mark.parametrize(("left", "fewer", "beaten"), [(0.266, 20, True), (0.266, 14, False), (0.26, 20, False)])
+@each(("left", "fewer", "beaten"), [(0.266, 20, True), (0.266, 14, False), (0.26, 20, False)])
 def test_models_are_compared_by_the_misfit_and_not_by_the_ratio_of_rms(monkeypatch, left, fewer, beaten):
     """The worse model has 0.091 px more of misfit than the other, or 0.071 px."""
     error = {"of": {}}

@@ -6,11 +6,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-
 from icalib.estimate.solver import CAREFUL_DAMPING, Damping, Descent, Step
+from tests.cases import each
 
 
-@pytest.mark.parametrize(
+@each(
     ("promised", "accepted", "creeps"),
     [((8.0, 6.0), (True, True), True), ((20.0, 12.0), (True, True), False), ((8.0, 6.0), (True, False), False)],
 )

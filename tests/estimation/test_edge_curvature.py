@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 from icalib.sensors.camera.corner_bias import with_bent_edges
 from icalib.tools.simulation.projection import project
+from tests.cases import each
 
 
 @pytest.fixture(scope="module")
@@ -27,8 +27,8 @@ def body_lines(setup, factor):
     return X @ R_ic, np.einsum("nji,nj->ni", R[stream.image], on_board) @ R_ic
 
 
-@pytest.mark.parametrize("middle", [0.0, 1.0], ids=["through the corner", "from the corner on"])
-@pytest.mark.parametrize("camera", [0, 1], ids=["radtan", "equidistant"])
+@each("middle", [0.0, 1.0])
+@each("camera", [0, 1])
 def test_corners_move_by_the_curvature_of_projected_lines(setup, factor_of, camera, middle):
     factor, rng = factor_of(setup, camera), np.random.default_rng(1)
     sim_camera = setup.sim.scenario.cameras[camera]

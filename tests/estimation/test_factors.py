@@ -12,12 +12,15 @@ import inspect
 import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.track_surfaces import ON_PLANES
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
+from tests.cases import each
 from tests.typed import not_none
 
 import icalib.optim
@@ -33,7 +36,6 @@ from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
-from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
@@ -804,24 +806,49 @@ def scales(sample):
     return np.concatenate([chain, sample.setup.columns_scale()])
 
 
-@pytest.fixture(scope="module", params=SAMPLES)
-def sample(request, unlike, setup_of, factor_of, features_of, features_on_planes, sparse_room, room_of):
-    name, make = SAMPLES[request.param]
-    in_room = name == "LidarFactor"
-    factors = (features_of, features_on_planes) if name == "FeatureFactor" else factor_of
-    made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
-    assert made.factor == name
-    return made
+@pytest.fixture(scope="module")
+def sample_of(unlike, setup_of, factor_of, features_of, features_on_planes, sparse_room, room_of):
+    """Makes the sample of a name, once."""
+
+    @cache
+    def made_as(name):
+        factor, make = SAMPLES[name]
+        in_room = factor == "LidarFactor"
+        factors = (features_of, features_on_planes) if factor == "FeatureFactor" else factor_of
+        made = make(unlike, (sparse_room, room_of) if in_room else setup_of, factors)
+        assert made.factor == factor
+        return made
+
+    return made_as
 
 
-def test_sums_are_those_of_numeric_derivatives(sample, dense):
+def directions(sample, H):
+    """(n, m): steps of one column each, for two keyframes and all calibration parameters of the factor, and random
+    steps of all other columns at once, in which a wrong sum shows as well."""
+    chain, rng = KEYFRAME_DIM * len(sample.state.seconds), np.random.default_rng(10)
+    first = KEYFRAME_DIM * (len(sample.state.seconds) // 2)
+    counts = np.diag(H) > 0.0
+    alone = (
+        counts
+        & (np.arange(len(H)) >= first)
+        & ((np.arange(len(H)) >= chain) | (np.arange(len(H)) < first + 2 * KEYFRAME_DIM))
+    )
+    mixed = [
+        rng.normal(size=(len(H), m)) * (own & ~alone)[:, None] / np.sqrt(max(1, (own & ~alone).sum()))
+        for own, m in ((counts, 6), (~counts, 2))
+    ]
+    return np.concatenate([np.eye(len(H))[:, alone], *mixed], axis=1)
+
+
+@each("name", SAMPLES)
+def test_sums_are_those_of_numeric_derivatives(name, sample_of, dense):
+    sample = sample_of(name)
     _, H, g = sums_of(sample, dense)
     y, W = sample.weights(sample.state)
     scale, h = scales(sample), 5e-3
-    J, slope = np.empty((len(y), len(g))), np.empty(len(g))
-    for n in range(len(g)):
-        d = np.zeros(len(g))
-        d[n] = h * scale[n]
+    D = directions(sample, H) * scale[:, None]
+    J, slope = np.empty((len(y), D.shape[1])), np.empty(D.shape[1])
+    for n, d in enumerate(h * D.T):
         # Five points, whose error is of the fourth order, so that the step is large beside the rounding of
         # hundreds of readings.
         far, near = ((moved(sample, k * d), moved(sample, -k * d)) for k in (2, 1))
@@ -829,7 +856,7 @@ def test_sums_are_those_of_numeric_derivatives(sample, dense):
             (8 * (f(near[0]) - f(near[1])) - (f(far[0]) - f(far[1]))) / (12 * h)
             for f in (sample.residual, sample.potential)
         )
-    H, g = H * np.outer(scale, scale), g * scale
+    H, g = D.T @ H @ D, D.T @ g
     numeric_H, numeric_g = J.T @ (W @ J), J.T @ y + slope
     size = np.sqrt(np.maximum(np.diag(numeric_H), 1e-9 * np.diag(numeric_H).max()))
     assert np.abs(numeric_g).max() > 0
@@ -839,7 +866,9 @@ def test_sums_are_those_of_numeric_derivatives(sample, dense):
     )
 
 
-def test_gradient_is_the_slope_of_the_cost(sample, dense):
+@each("name", SAMPLES)
+def test_gradient_is_the_slope_of_the_cost(name, sample_of, dense):
+    sample = sample_of(name)
     cost, _, g = sums_of(sample, dense)
     assert cost > 0
     rng, scale, h = np.random.default_rng(9), scales(sample), 2e-5
@@ -849,12 +878,16 @@ def test_gradient_is_the_slope_of_the_cost(sample, dense):
         assert slope == pytest.approx(g @ d, rel=sample.tolerance, abs=sample.tolerance * np.linalg.norm(g * scale))
 
 
-def test_cost_without_sums_is_the_cost_with_them(sample, dense):
+@each("name", SAMPLES)
+def test_cost_without_sums_is_the_cost_with_them(name, sample_of, dense):
+    sample = sample_of(name)
     assert cost_at(sample, np.zeros(len(scales(sample)))) == pytest.approx(sums_of(sample, dense)[0], rel=1e-13)
 
 
-def test_rows_are_the_residuals_by_kind(sample):
+@each("name", SAMPLES)
+def test_rows_are_the_residuals_by_kind(name, sample_of):
     """Number, chi^2, RMS and unit are those that the factor gives for each kind; times are those of the keyframes."""
+    sample = sample_of(name)
     if sample.made is None:
         assert sample.factor in ("Prior", "accumulate_bias_prior")
         return

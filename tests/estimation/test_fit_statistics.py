@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.jacobian_noise import spurious_information
+from icalib.estimate.solver import Draws, Outcome, SolverOptions, minimise, posterior
+from tests.cases import each
 from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
 from tests.typed import not_none
 
-from icalib.estimate.jacobian_noise import spurious_information
 from icalib.estimate.residual_statistics import fits
-from icalib.estimate.solver import Draws, Outcome, SolverOptions, minimise, posterior
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.sensors.camera.corner_factor import CornerFactor
@@ -36,7 +37,7 @@ def columns_of(solution):
     return np.concatenate([chain.reshape(-1, ends[-1]), calib[:-1]])
 
 
-@pytest.mark.parametrize("n_keyframes", [1, 3, 4, 9])
+@each("n_keyframes", [1, 3, 4, 9])
 def test_draws_have_the_covariance_of_the_posterior(dense, n_keyframes):
     pieces = random_pieces(n_keyframes, 3)
     H, _ = dense(pieces, n_keyframes)
@@ -45,7 +46,7 @@ def test_draws_have_the_covariance_of_the_posterior(dense, n_keyframes):
     np.testing.assert_allclose(X @ X.T, inverse, rtol=0, atol=1e-10 * np.abs(inverse).max())
 
 
-@pytest.mark.parametrize(("per_keyframe", "by_next"), [(1, False), (2, False), (2, True)])
+@each(("per_keyframe", "by_next"), [(1, False), (2, False), (2, True)])
 def test_draws_have_the_covariance_of_the_posterior_where_features_tie_keyframes(per_keyframe, by_next):
     pieces, H, _ = build(9, 12, 3, per_keyframe=per_keyframe, by_next=by_next)
     X = columns_of(solve(pieces, 9, np.ones(3)))

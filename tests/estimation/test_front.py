@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.optim.arrowhead import NotDefiniteError, Piece, make_pieces, marginalise, solve
 from icalib.optim.front import GROUP_SIZES, FeatureSums, PieceFeatures, plan
@@ -95,14 +96,14 @@ def check(pieces, H, g, n_keyframes):
     np.testing.assert_allclose(solution.information, information, rtol=0, atol=1e-8 * np.abs(information).max())
 
 
-@pytest.mark.parametrize("n_tracks", [0, 1, 7, 40])
-@pytest.mark.parametrize("n_keyframes", [3, 4, 5, 8, 11])
+@each("n_tracks", [0, 1, 7, 40])
+@each("n_keyframes", [3, 4, 5, 8, 11])
 def test_solution_is_the_dense_one(n_keyframes, n_tracks):
     check(*build(n_keyframes, n_tracks, 3), n_keyframes)
 
 
-@pytest.mark.parametrize("sizes", [(1,), (3,), GROUP_SIZES])
-@pytest.mark.parametrize(("per_keyframe", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
+@each("sizes", [(1,), (3,), GROUP_SIZES])
+@each(("per_keyframe", "by_next"), [(1, False), (2, False), (3, False), (1, True), (2, True)])
 def test_solution_is_the_dense_one_however_images_hang_on_keyframes(per_keyframe, by_next, sizes):
     check(*build(13, 30, 2, per_keyframe=per_keyframe, by_next=by_next, sizes=sizes), 13)
 

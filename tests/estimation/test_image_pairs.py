@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.optim.rows import LOSSES, robust_weights
 from icalib.rig import Settings
@@ -42,8 +43,8 @@ def output(camera: CornerFactor, late: tuple[int, ...], tau: float) -> tuple[Cor
     return camera, out
 
 
-@pytest.mark.parametrize("tau", [0.0, 1.0])
-@pytest.mark.parametrize("late", [(), (0,), (5,)])
+@each("tau", [0.0, 1.0])
+@each("late", [(), (0,), (5,)])
 def test_late_images_are_found_whether_or_not_a_common_error_compensates_them(cameras, late, tau):
     """With tau of 1 px, the common error compensates nearly all of the 5 px."""
     pairs = [output(camera, late if k == 2 else (), tau) for k, camera in enumerate(cameras)]

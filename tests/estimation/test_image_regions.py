@@ -8,12 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import Outcome, SolverOptions, minimise
+from icalib.sensors.camera.track_factor import FeatureFactor
+from icalib.sensors.camera.track_selection import _tag_corners
+from icalib.sensors.camera.track_selection import image_cells as cells_of
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
 from icalib.estimate.problem import Problem, assemble
 from icalib.estimate.residual_statistics import _cluster_gradients, _count, cluster_covariances
-from icalib.estimate.solver import Outcome, SolverOptions, minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies
@@ -42,7 +45,7 @@ def followers(seconds: float) -> Scenario:
 def solved() -> tuple[Problem, Outcome]:
     """Without noise, so that residuals are next to nothing."""
     exact = {"imu_noise_enabled": False, "robot_noise_enabled": False}
-    scenario = replace(followers(5.0), **exact)
+    scenario = replace(followers(3.0), **exact)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
     problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, inputs.measurements))
@@ -77,7 +80,7 @@ def test_the_gradient_of_a_cell_is_what_its_residuals_change(solved: tuple[Probl
     assert found.shape == (_count(cells), problem.layout.size) and _count(cells) == 36
     residual = output_at(of_type(problem.factors, FeatureFactor)[0], outcome.state).residual
     before, size = gradient(problem, outcome), np.abs(found).max(axis=0)
-    for cell in (1, 14, 30):
+    for cell in (1, 30):
         twice = moved(problem, [-r * (own == cell)[:, None] for r, own in zip(residual, tracks, strict=True)])
         change = gradient(twice, outcome) - before
         np.testing.assert_allclose(change / size, found[cell] / size, atol=1e-3)
@@ -117,15 +120,22 @@ def errors(rig: Rig, scenario: Scenario, seed: int, seen) -> tuple[np.ndarray, n
     return np.concatenate(formal), np.concatenate(printed)
 
 
-def test_a_lens_that_no_model_follows_is_in_the_standard_deviations():
-    scenario = followers(24.0)
+@pytest.fixture(scope="module")
+def long_drive() -> tuple[Rig, Scenario]:
+    scenario = followers(12.0)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
-    rig = replace(rig, settings=replace(rig.settings, segments=8))
-    rms = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: bent(m, scenario))]
-    honest = [np.sqrt(np.mean(z**2)) for z in errors(rig, scenario, 1, lambda m: m)]
-    print(rms, honest)
-    assert rms[0] > 5.0 and rms[1] < 2.0
-    assert honest[0] < 1.5 and honest[1] > 0.5 * honest[0]
+    return replace(rig, settings=replace(rig.settings, segments=8)), scenario
+
+
+def test_a_lens_that_no_model_follows_is_in_the_standard_deviations(long_drive: tuple[Rig, Scenario]):
+    formal, printed = (np.sqrt(np.mean(z**2)) for z in errors(*long_drive, 1, lambda m: bent(m, long_drive[1])))
+    assert formal > 5.0 and printed < 2.0
+
+
+@pytest.mark.full
+def test_a_lens_that_the_model_follows_leaves_standard_deviations_small(long_drive: tuple[Rig, Scenario]):
+    formal, printed = (np.sqrt(np.mean(z**2)) for z in errors(*long_drive, 1, lambda m: m))
+    assert formal < 1.5 and printed > 0.5 * formal
 
 
 def drifting(stream: TrackStream, sigma: float, rng: np.random.Generator) -> TrackStream:
@@ -154,7 +164,7 @@ def track_spread(measurements: Measurements, rig: Rig) -> float:
 
 
 def test_errors_that_stay_along_a_track_are_in_the_standard_deviations():
-    scenario = replace(followers(12.0), robot_noise_enabled=False)
+    scenario = replace(followers(6.0), robot_noise_enabled=False)
     scenario = replace(scenario, cameras=scenario.cameras[:1])
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     clean, rng = simulate(scenario, 1).measurements, np.random.default_rng(1)

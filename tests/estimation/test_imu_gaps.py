@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
@@ -19,14 +19,12 @@ def gaps(seconds: np.ndarray) -> int:
     return len(ImuData.build(stream, class_noise("consumer")).gaps)
 
 
-@pytest.mark.parametrize("rate", [20.0, 200.0, 2000.0])
+@each("rate", [20.0, 200.0, 2000.0])
 def test_even_readings_have_none(rate):
     assert gaps(np.arange(400) / rate) == 0
 
 
-@pytest.mark.parametrize(
-    ("rate", "pause", "count"), [(200.0, 0.012, 0), (200.0, 0.02, 1), (2000.0, 0.008, 0), (2000.0, 0.02, 1)]
-)
+@each(("rate", "pause", "count"), [(200.0, 0.012, 0), (200.0, 0.02, 1), (2000.0, 0.008, 0), (2000.0, 0.02, 1)])
 def test_a_pause(rate, pause, count):
     t = np.arange(400) / rate
     assert gaps(np.where(t >= t[200], t + pause - 1.0 / rate, t)) == count

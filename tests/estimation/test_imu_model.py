@@ -1,8 +1,8 @@
 """The scale-misalignment model: undone exactly, and its derivatives."""
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.motion.imu_data import correction_matrices
 from icalib.motion.integration_step import AT_INTRINSICS, J_STRIDE, RUN_SIZE, correction, fill_intrinsics
@@ -31,7 +31,7 @@ def random_intrinsics(seed, size):
     return size * np.random.default_rng(seed).normal(size=N_INTRINSICS)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-2, 0.1])
+@each("size", [0.0, 1e-9, 1e-2, 0.1])
 def test_correction_undoes_the_model(size):
     intrinsics = random_intrinsics(1, size)
     rate, force = corrected(intrinsics, *model(intrinsics, RATE, FORCE))
@@ -39,7 +39,7 @@ def test_correction_undoes_the_model(size):
     np.testing.assert_allclose(force, FORCE, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-2, 0.1])
+@each("size", [0.0, 1e-9, 1e-2, 0.1])
 def test_derivatives_by_central_differences(size):
     intrinsics = random_intrinsics(2, size)
     gyro, accel = np.array([0.5, 1.0, -0.8]), np.array([-1.0, 4.0, 8.0])
@@ -55,7 +55,7 @@ def test_derivatives_by_central_differences(size):
         np.testing.assert_allclose(d_force[:, n], (plus[1] - minus[1]) / (2 * h), atol=1e-7, err_msg=LABELS[n])
 
 
-@pytest.mark.parametrize(
+@each(
     ("label", "reading", "axis"),
     [("accel_yy", 1, 1), ("accel_zx", 1, 2), ("gyro_xx", 0, 0), ("gyro_zy", 0, 2), ("g_sensitivity_yz", 0, 1)],
 )

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.motion import reference_motion
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.geometry import so3
@@ -21,7 +23,6 @@ from icalib.motion.integration import (
 from icalib.motion.integration_step import COVARIANCE_SIZE, RUN_SIZE, correction
 from icalib.rig import ImuNoise
 from icalib.tools.simulation import handheld
-from icalib.tools.simulation.motion import reference_motion
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])
@@ -106,9 +107,10 @@ def by_expm(r, t0, t1, bias=BIAS, intrinsics=None, parts=60):
     stops = [t0, *sorted(inner, reverse=bool(t1 < t0)), t1]
     X = np.eye(5)
     for a, b in zip(stops[:-1], stops[1:], strict=True):
-        for k in range(parts):
-            rate, force = corrected_at(r, a + (k + 0.5) * (b - a) / parts, bias, intrinsics)
-            X = X @ expm(generator(rate, force) * (b - a) / parts)
+        x = np.array([r.at(a + (k + 0.5) * (b - a) / parts) for k in range(parts)])
+        rates, forces = corrected(x[:, :3], x[:, 3:], bias, intrinsics)
+        for step in expm(np.stack([generator(w, f) for w, f in zip(rates, forces, strict=True)]) * (b - a) / parts):
+            X = X @ step
     return X[:3, :3], X[:3, 3], X[:3, 4]
 
 
@@ -133,9 +135,9 @@ SPANS = {
 }
 
 
-@pytest.mark.parametrize("intrinsics", [None, INTRINSICS], ids=["ideal", "intrinsics"])
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("span", SPANS)
+@each("intrinsics", [None, INTRINSICS])
+@each("backwards", [False, True])
+@each("span", SPANS)
 def test_increments_are_products_of_matrix_exponentials(span, backwards, intrinsics):
     """Steps of 2 to 11 ms, whose rates change by up to 3 rad/s. Second-order terms, here 2e-4 m/s, are those of
     readings as recorded, and the intrinsics are errors of 2 %."""
@@ -147,8 +149,8 @@ def test_increments_are_products_of_matrix_exponentials(span, backwards, intrins
     assert_same(found, expected, 5e-6 if intrinsics is None else 3e-5)
 
 
-@pytest.mark.parametrize("angle", ANGLES)
-@pytest.mark.parametrize("backwards", [False, True])
+@each("angle", ANGLES)
+@each("backwards", [False, True])
 def test_one_step_at_every_angle_with_unit_force(angle, backwards):
     r = Irregular.constant(np.array([0.0, 1.0]), angle * UNIT, UNIT[[1, 2, 0]])
     t0, t1 = (1.0, 0.0) if backwards else (0.0, 1.0)
@@ -208,8 +210,8 @@ def test_starting_in_either_interval_at_a_stamp_is_the_same(backwards):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
-@pytest.mark.parametrize("order", ["of keyframes", "of time", "any"])
-@pytest.mark.parametrize("width", [0, 6, 30])
+@each("order", ["of keyframes", "of time", "any"])
+@each("width", [0, 6, 30])
 def test_what_is_carried_on_is_what_starts_anew(order, width):
     """Bit by bit, whatever the order; instants lie on stamps and keyframes, between, and beyond both ends."""
     rng = np.random.default_rng(3)
@@ -248,9 +250,9 @@ def test_rate_and_force_at_the_end_are_those_of_the_signal(backwards):
     np.testing.assert_allclose(force, f, atol=1e-13)
 
 
-@pytest.mark.parametrize("intrinsics", [np.zeros(24), INTRINSICS], ids=["ideal", "intrinsics"])
-@pytest.mark.parametrize("backwards", [False, True])
-@pytest.mark.parametrize("span", ["between stamps", "stamp to stamp", "within one interval", "whole"])
+@each("intrinsics", [np.zeros(24), INTRINSICS])
+@each("backwards", [False, True])
+@each("span", ["between stamps", "stamp to stamp", "within one interval", "whole"])
 def test_jacobians_by_central_differences(span, backwards, intrinsics):
     t0, t1 = SPANS[span][::-1] if backwards else SPANS[span]
     R, _, _, J, _, _ = run(R0, t0, t1, intrinsics=intrinsics, width=30)
@@ -262,7 +264,7 @@ def test_jacobians_by_central_differences(span, backwards, intrinsics):
         np.testing.assert_allclose(J[:, n], difference(plus, minus, R, h), rtol=1e-7, atol=1e-9, err_msg=str(n))
 
 
-@pytest.mark.parametrize("angle", ANGLES)
+@each("angle", ANGLES)
 def test_bias_jacobian_of_one_step_at_every_angle(angle):
     r = Irregular.constant(np.array([0.0, 1.0]), angle * UNIT, UNIT[[1, 2, 0]])
     zero, h = np.zeros(6), 1e-5

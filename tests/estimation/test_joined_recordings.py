@@ -6,12 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.data.measurements import PAUSE_NS, Measurements, join
 from icalib.data.recordings import naming, open_all
 from icalib.errors import RecordingError
-from icalib.estimate.inputs import inputs_for
 from icalib.estimate.problem import assemble
 from icalib.estimate.residual_statistics import segment_ends
 from icalib.geometry import so3
@@ -186,7 +187,7 @@ def test_a_state_knows_its_recordings():
     assert state.recordings == [slice(0, 3), slice(3, 5), slice(5, 7)]
 
 
-@pytest.mark.parametrize(
+@each(
     ("starts", "n", "segments", "expected"),
     [
         ((0,), 101, 4, [0, 25, 50, 75, 100]),

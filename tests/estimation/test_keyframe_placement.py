@@ -1,7 +1,7 @@
 """Where keyframes stand: at images, filled in between, none in long gaps."""
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.motion.imu_data import ImuData
@@ -50,7 +50,7 @@ def test_long_stretches_are_filled_evenly_and_all_images_are_keyframes():
         np.testing.assert_allclose(steps, steps[0], rtol=1e-9)
 
 
-@pytest.mark.parametrize(("distance", "steps"), [(0.04, 1), (0.0545, 1), (0.0555, 2), (0.104, 2), (0.106, 3)])
+@each(("distance", "steps"), [(0.04, 1), (0.0545, 1), (0.0555, 2), (0.104, 2), (0.106, 3)])
 def test_jitter_of_a_tenth_of_the_spacing_needs_no_keyframe(distance, steps):
     keyframes = place_keyframes(imu_at(STEADY), [np.array([0.1, 0.1 + distance])], spacing=0.05, max_gap=0.5)
     assert len(keyframes) == 1 + steps

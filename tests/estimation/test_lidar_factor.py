@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
@@ -103,9 +104,9 @@ def sums(setup, factor, state, dense):
     return cost, *dense(pieces, factor.n_keyframes), out.residual
 
 
-@pytest.mark.parametrize("bin_s", [1e-3, 1e-4, 2e-6])
-@pytest.mark.parametrize("loss", ["none", "huber", "cauchy"])
-@pytest.mark.parametrize("beam", [0.0, 0.03])
+@each("bin_s", [1e-3, 1e-4, 2e-6])
+@each("loss", ["none", "huber", "cauchy"])
+@each("beam", [0.0, 0.03])
 def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, beam):
     """But for the instants at which states act on them, wrong by half a bin at most: of 25 ms from the keyframe.
     Without the gyroscope's noise, of which test_factors.py knows."""

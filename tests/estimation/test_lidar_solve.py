@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import minimise
 from scipy.stats import chi2
 from tests.typed import not_none
 
 from icalib.detection.planes import PlaneSearch, find_planes
-from icalib.estimate.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.state import make_layout
 from icalib.sensors.lidar.binning import BIN_S, LidarNoise, in_world
@@ -50,7 +50,7 @@ def recover(setup, start, noise, passes, **options):
 def test_noiseless_recovery(robot, room_of):
     """Bins are short, and readings dense: between two the simulated rate is constant and the estimator's linear, in the
     mean w' T^2 / 12 apart (at 300 Hz 6e-6 rad)."""
-    scenario = robot(6.0, noiseless=True)
+    scenario = robot(4.0, noiseless=True)
     scenario = replace(scenario, imu_rate_hz=8000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
     setup = room_of(simulate(scenario, seed=1), spacing=5e-3)
     outcome = recover(setup, setup.perturbed(np.random.default_rng(2), 3.0), LidarNoise(0.03), 2, bin_s=1e-4)
@@ -119,6 +119,7 @@ def check_nees(robot, room_of, name, seeds, probability):
         assert low <= sum(nees) / dof <= high, part
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("name", ["table2-3d", "table2-ramp"])
 def test_a_few_recordings(robot, room_of, name):
     check_nees(robot, room_of, name, range(3), 0.9999)
@@ -161,7 +162,7 @@ def wrong_by_a_centimetre(setup, rng):
 
 def test_found_planes_do_nearly_as_well_as_known_ones(robot, room_of):
     """Planes and association made anew in three rounds, each with the trajectory of the last."""
-    setup = room_of(simulate(robot(10.0, azimuth_steps=900), seed=7))
+    setup = room_of(simulate(robot(6.0, azimuth_steps=900), seed=7))
     huber = LidarNoise(0.03, loss="huber")
     known = recover(setup, setup.state, huber, 2)
     state, entries = wrong_by_a_centimetre(setup, np.random.default_rng(3))

@@ -6,11 +6,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from icalib.estimate.solver import SolverOptions, minimise
 from scipy.optimize import minimize
+from tests.cases import each
 from tests.typed import StandIn
 
-from icalib.estimate.solver import SolverOptions, minimise
 from icalib.optim.anderson import Accelerator
 from icalib.optim.arrowhead import NO_DIRECTIONS, make_pieces, solve
 from icalib.optim.state import State, make_layout
@@ -163,7 +163,7 @@ def test_an_early_pass_finds_the_damping_it_needs_in_few_tries_and_lets_go_of_it
     assert outcome.steps[-1].damping == 0.0
 
 
-@pytest.mark.parametrize("c", [0.7, 0.9, -0.9])
+@each("c", [0.7, 0.9, -0.9])
 def test_it_is_quick_where_plain_steps_converge_slowly(c, monkeypatch):
     problem, one = Saddle(c), np.zeros((1, 3))
     start = State(np.zeros(1), np.eye(3)[None], one, one, np.zeros((1, 6)), {KEY: np.array([5.0, -3.0])})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.optim.rows import grouped_quantiles, largest_normal, median_variance
 
@@ -22,7 +23,7 @@ def test_the_limit_is_mean_and_deviations_of_normal_errors(share: float):
     assert limit == pytest.approx(size.mean() + 4.0 * size.std(), rel=0.01)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 0.9, 1.0])
+@each("share", [0.0, 0.5, 0.9, 1.0])
 def test_quantiles_by_group(share: float):
     rng = np.random.default_rng(3)
     x, group = rng.normal(size=500), rng.integers(0, 40, 500)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
-from icalib.estimate.parameter_changes import Candidate, Change, Scatter, _Form
+from icalib.estimate.residual_statistics import Candidate, Change, Scatter, _Form
 
 G, B = 8, 6
 COLUMNS, PATTERN = np.arange(3), np.arange(G) - 3.5
@@ -54,7 +54,7 @@ def test_a_direction_that_the_data_hardly_determine_does_not_change():
     assert change.dof == 2 and abs(change.step[1]) < 1e-2 and change.std[1] > 9.9
 
 
-@pytest.mark.parametrize(
+@each(
     ("gain", "rival", "expected"),
     [(900.0, 100.0, True), (900.0, 895.0, False), (90.0, 0.0, False), (3000.0, 0.0, False)],
 )

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from icalib.optim.arrowhead import make_pieces
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import MAX_DISTANCE_M
 from icalib.sensors.camera.tracks import FeatureOutput
+from tests.cases import each
+
+from icalib.optim.arrowhead import make_pieces
 from icalib.tools.simulation import handheld, simulate
 
 
@@ -34,7 +35,7 @@ def looked_for(factor: FeatureFactor, start: np.ndarray) -> FeatureFactor:
     return replace(factor, tracks=replace(factor.tracks, start=start))
 
 
-@pytest.mark.parametrize("times", [0.5, 10.0, 1e4])
+@each("times", [0.5, 10.0, 1e4])
 def test_points_come_back_from_near_and_far(factor, setup, times: float):
     """Once a step had thrown one to 1e13 m it stayed there, a hundred of them costing as much as all else."""
     cost, out = outcome(factor, setup.state)

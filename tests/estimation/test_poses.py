@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
+from tests.cases import each
 
 from icalib.geometry import so3
 from icalib.motion.poses import assign_keyframes, poses_and_velocity_derivatives, poses_at
@@ -42,7 +43,7 @@ def difference(plus, minus, at, h):
     return np.concatenate([turn, plus.position - minus.position], axis=1) / (2 * h)
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@each("scheme", SCHEMES)
 def test_jacobians_of_every_keyframe_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(1))
     at, keyframe = evaluate(setup, scheme, state)
@@ -59,7 +60,7 @@ def test_jacobians_of_every_keyframe_by_central_differences(setup, scheme):
             np.testing.assert_allclose(analytic, difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=f"{k} {j}")
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@each("scheme", SCHEMES)
 def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
     state = setup.perturbed(np.random.default_rng(2))
     at, _ = evaluate(setup, scheme, state)
@@ -72,7 +73,7 @@ def test_jacobians_of_the_imu_intrinsics_by_central_differences(setup, scheme):
         np.testing.assert_allclose(at.J_imu[:, :, n], difference(plus, minus, at, h), rtol=0, atol=5e-9, err_msg=str(n))
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@each("scheme", SCHEMES)
 def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
     """Through random rows of a camera's pose, along its own axes: by all keyframes, extrinsics and IMU intrinsics, and
     by the time offset as far as the rate says."""
@@ -146,9 +147,7 @@ def test_acceleration_is_the_time_derivative_of_the_velocity(setup):
 
 
 # Rate and velocity of `inertial` are those at the end, without the third-order terms of the step (readings 5 ms apart).
-@pytest.mark.parametrize(
-    ("scheme", "rate", "velocity"), [("inertial", 2e-6, 2e-5), ("kinematic", 1e-8, 1e-8), ("pose", 1e-8, 1e-8)]
-)
+@each(("scheme", "rate", "velocity"), [("inertial", 2e-6, 2e-5), ("kinematic", 1e-8, 1e-8), ("pose", 1e-8, 1e-8)])
 def test_rate_and_velocity_are_the_time_derivative(setup, scheme, rate, velocity):
     state, h = setup.perturbed(np.random.default_rng(3)), 1e-6
     at, _ = evaluate(setup, scheme, state)
@@ -255,7 +254,7 @@ def corrected_rate(intrinsics, readings):
     return np.linalg.solve(M_g, (readings[:, :3] - sensed).T).T
 
 
-@pytest.mark.parametrize("scheme", SCHEMES)
+@each("scheme", SCHEMES)
 def test_at_a_keyframe_every_scheme_gives_the_keyframe(setup, scheme):
     state = setup.perturbed(np.random.default_rng(4))
     keyframe = assign_keyframes(scheme, state.seconds, state.seconds)
@@ -267,8 +266,8 @@ def test_at_a_keyframe_every_scheme_gives_the_keyframe(setup, scheme):
 N_KEYFRAMES = np.array([0.0, 1.0, 3.0])
 
 
-@pytest.mark.parametrize("scheme", ["inertial", "kinematic"])
-@pytest.mark.parametrize(
+@each("scheme", ["inertial", "kinematic"])
+@each(
     ("time", "keyframe"),
     [(-5.0, 0), (0.0, 0), (0.4, 0), (0.6, 1), (1.0, 1), (1.9, 1), (2.1, 2), (3.0, 2), (9.0, 2)],
 )
@@ -276,13 +275,13 @@ def test_nearest_keyframe(scheme, time, keyframe):
     assert assign_keyframes(scheme, N_KEYFRAMES, np.array([time]))[0] == keyframe
 
 
-@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
-@pytest.mark.parametrize("time", [0.5, 2.0])
+@each("rounding", [-1e-9, 0.0, 1e-9])
+@each("time", [0.5, 2.0])
 def test_in_the_middle_the_earlier_keyframe_is_taken_whatever_the_rounding(time, rounding):
     nearest = assign_keyframes("inertial", N_KEYFRAMES, np.array([time + rounding]))[0]
     assert N_KEYFRAMES[nearest] < time
 
 
-@pytest.mark.parametrize(("time", "keyframe"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
+@each(("time", "keyframe"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
 def test_pose_takes_the_keyframe_before_that_has_one_after(time, keyframe):
     assert assign_keyframes("pose", N_KEYFRAMES, np.array([time]))[0] == keyframe

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.observability import prior_sensitivity as module
 from icalib.observability.prior_sensitivity import (
@@ -88,7 +89,7 @@ def sensitivity(given, data: np.ndarray | None = None) -> np.ndarray:
     return prior_sensitivity(given.inputs, given.outcome, nothing if data is None else data, nothing)
 
 
-@pytest.mark.parametrize(("pull", "sigmas", "moves"), [(0.1, 1.0, True), (9.0, 1.9, False), (9.0, -2.1, True)])
+@each(("pull", "sigmas", "moves"), [(0.1, 1.0, True), (9.0, 1.9, False), (9.0, -2.1, True)])
 def test_only_where_noise_pulls_to_near_the_guess_a_direction_stays(given, pull: float, sigmas: float, moves: bool):
     """The mixture of height and time, pulled to some standard deviations from the guess; nothing pulls at the shift of
     both. Which axes the span is given in does not matter."""

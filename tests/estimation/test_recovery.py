@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import CONVERGED_DECREASE, SolverOptions, minimise
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
 from icalib.estimate import solver
-from icalib.estimate.solver import CONVERGED_DECREASE, SolverOptions, minimise
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import N_THREADS, solve
@@ -140,6 +140,7 @@ def test_a_start_that_predicts_nothing_finite_is_an_error(noisy_problem):
         minimise(problem, bad)
 
 
+@pytest.mark.full
 def test_slow_motion_and_a_poor_imu_converge_although_gravity_is_hardly_known():
     """The tilt of the board then moves by degrees, and with it, in one step, accelerometer bias and lever arm."""
     scenario = handheld(20.0, imu="noisy")

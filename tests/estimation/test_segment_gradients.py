@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import Outcome, minimise
 from tests.typed import not_none
 
 from icalib.estimate.problem import Problem
 from icalib.estimate.residual_statistics import Segments, noise_variance, split_covariance, split_expectation
-from icalib.estimate.solver import Outcome, minimise
 from icalib.motion.factor import keyed
 from icalib.optim.arrowhead import KEYFRAME_DIM, Piece, Prior
 from icalib.sensors.imu.residual import ImuFactor
@@ -97,7 +97,7 @@ def test_gradients_are_slopes_of_the_cost_of_each_segment(case, request, dense):
         assert slope == pytest.approx(parts.gradients[g] @ direction, rel=1e-3, abs=1e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.full
 def test_gradients_scatter_as_expected_of_white_noise(setup_of, problem_of):
     """Over 20 recordings; the mean ratio has a standard error of 5 %. Trajectories that follow the noise at the ends of
     segments take about 5 % of the scatter."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.geometry.blas import factorise, solve_transposed, solve_upper, subtract_gram, subtract_product
 
@@ -19,7 +20,7 @@ def rng():
     return np.random.default_rng(0)
 
 
-@pytest.mark.parametrize(("k", "m", "n"), [(7, 6, 20), (1, 1, 1), (1, 5, 1), (0, 4, 3), (40, 130, 90)])
+@each(("k", "m", "n"), [(7, 6, 20), (1, 1, 1), (1, 5, 1), (0, 4, 3), (40, 130, 90)])
 def test_products_are_subtracted(rng, k, m, n):
     A, B = block(rng, k, m)[0], block(rng, k, n)[0]
     C, whole = block(rng, m, n)
@@ -29,7 +30,7 @@ def test_products_are_subtracted(rng, k, m, n):
     np.testing.assert_allclose(whole, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize(("k", "n"), [(7, 20), (1, 1), (0, 3), (130, 90)])
+@each(("k", "n"), [(7, 20), (1, 1), (0, 3), (130, 90)])
 def test_gram_is_subtracted_from_the_upper_triangle_alone(rng, k, n):
     W, (C, whole) = block(rng, k, n)[0], block(rng, n, n)
     expected = whole.copy()
@@ -38,7 +39,7 @@ def test_gram_is_subtracted_from_the_upper_triangle_alone(rng, k, n):
     np.testing.assert_allclose(whole, expected, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [0, 1, 3, 70])
+@each("n", [0, 1, 3, 70])
 def test_factors_and_solutions(rng, n):
     J, (A, _), (X, _) = rng.standard_normal((2 * n + 1, n)), block(rng, n, n), block(rng, n, 4)
     H, right = J.T @ J, X.copy()
@@ -53,6 +54,6 @@ def test_factors_and_solutions(rng, n):
     np.testing.assert_allclose(U @ x, right[:, 0], rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize("bad", [-1.0, 0.0, np.nan, np.inf])
+@each("bad", [-1.0, 0.0, np.nan, np.inf])
 def test_what_is_not_positive_definite_is_refused(bad):
     assert not factorise(np.diag([1.0, bad, 1.0]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from tests.cases import each
 
 from icalib.errors import CalibrationError
 from icalib.geometry.cameras import camera_model
@@ -45,7 +46,7 @@ def test_a_lens_that_needs_no_third_coefficient_comes_back_without_it() -> None:
     assert largest < 1e-9
 
 
-@pytest.mark.parametrize(
+@each(
     ("source", "params", "target", "rms_range"),
     [
         (RADTAN5, EUROC5, RADTAN, (0.3, 1.0)),
@@ -76,7 +77,7 @@ def test_the_third_coefficient_is_worth_having() -> None:
     assert with_it < 0.5 * without
 
 
-@pytest.mark.parametrize("f", [350.0, 330.0])
+@pytest.mark.parametrize("f", [350.0, pytest.param(330.0, marks=pytest.mark.full)])
 def test_a_best_fit_beyond_the_monotonic_range_is_replaced_by_one_inside(f: float) -> None:
     """73 and 78 degrees: with k3 the best fit folds back inside the image, and one without k3 is always allowed."""
     fitted, with_it, _ = fit_model(EQUIDISTANT, fisheye(f), RADTAN5, IMAGE)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.geometry.so3 import LEAST_SIGMAS, rpy, rpy_jacobian, rpy_std
 
@@ -41,7 +41,7 @@ def test_the_jacobian_is_that_of_central_differences():
         np.testing.assert_allclose(J, numeric, atol=1e-7 * np.abs(J).max() ** 3)
 
 
-@pytest.mark.parametrize("angles", [(10.0, 5.0, 100.0), (-80.0, 60.0, 20.0), (40.0, -75.0, -30.0)])
+@each("angles", [(10.0, 5.0, 100.0), (-80.0, 60.0, 20.0), (40.0, -75.0, -30.0)])
 def test_standard_deviations_are_those_of_samples(angles: tuple[float, float, float]):
     np.testing.assert_allclose(rpy_std(of(*angles), COVARIANCE), sampled(of(*angles), COVARIANCE), rtol=0.01)
 

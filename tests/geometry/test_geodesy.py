@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from scipy.integrate import quad
+from tests.cases import each
 
 from icalib.geometry.geodesy import FLATTENING, SEMI_MAJOR_AXIS_M, earth_centred, latitude_longitude, local_metres
 
@@ -17,7 +17,7 @@ def test_the_point_of_the_guidance_note():
     np.testing.assert_allclose(latitude_longitude(xyz[0]), [latitude, longitude], atol=1e-12)
 
 
-@pytest.mark.parametrize("degrees", [-70.0, 0.0, 40.0, 89.0])
+@each("degrees", [-70.0, 0.0, 40.0, 89.0])
 def test_metres_to_the_north_are_the_arc_of_the_meridian(degrees):
     """Of an ellipse by its parametric form; 100 m along it are a chord of 100 m to 1e-8."""
     b = SEMI_MAJOR_AXIS_M * (1.0 - FLATTENING)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.geometry.planes import moved, plane_of, tangents
@@ -18,15 +19,15 @@ def normals() -> np.ndarray:
     return both / np.linalg.norm(both, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("normal", normals())
+@each("normal", normals())
 def test_tangents_and_normal_are_a_right_handed_frame(normal: np.ndarray):
     frame = np.vstack([tangents(normal), normal])
     np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-14)
     assert np.linalg.det(frame) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("normal", normals())
-@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-2, 1.0, 3.0])
+@each("normal", normals())
+@each("size", [0.0, 1e-12, 1e-6, 1e-2, 1.0, 3.0])
 def test_a_correction_turns_the_normal_by_its_size_about_the_planes_point(normal: np.ndarray, size: float):
     point, direction = np.array([3.0, -2.0, 1.0]), np.array([0.6, -0.8])
     plane = moved(plane_of(normal, point), np.append(size * direction, 0.0))

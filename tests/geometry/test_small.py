@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.geometry.small import cross3, eigen3, mulv3, tmulv3
 
 VALUES = [(1.0, 2.0, 3.0), (1e-8, 1.0, 1.0), (2.0, 2.0, 2.0), (-1.0, 1e-12, 100.0), (0.0, 0.0, 0.0)]
 
 
-@pytest.mark.parametrize("values", VALUES)
+@each("values", VALUES)
 def test_eigenvalues_and_vectors_are_those_of_numpy(values):
     rng = np.random.default_rng(3)
     for _ in range(20):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.geometry import so3
@@ -22,8 +23,8 @@ AXES = np.array(
 )
 AXES /= np.linalg.norm(AXES, axis=1, keepdims=True)
 
-at_every_angle = pytest.mark.parametrize("angle", ANGLES)
-below_pi = pytest.mark.parametrize("angle", BELOW_PI)
+at_every_angle = each("angle", ANGLES)
+below_pi = each("angle", BELOW_PI)
 
 
 def vectors(angle: float) -> np.ndarray:
@@ -58,7 +59,7 @@ def test_hat_is_the_cross_product() -> None:
     np.testing.assert_allclose(so3.hat_many(many) @ w, np.cross(many, w), rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 2 * pi, 10.0])
+@each("angle", [*ANGLES, 4.0, 2 * pi, 10.0])
 def test_exp(angle: float) -> None:
     for phi in vectors(angle):
         R = so3.exp(phi)
@@ -86,7 +87,7 @@ def test_log_of_half_a_turn_is_the_axis_up_to_sign() -> None:
         np.testing.assert_allclose(np.abs(so3.log(half_turn)), pi * np.eye(3)[i], atol=1e-15)
 
 
-@pytest.mark.parametrize("angle", [4.0, 2 * pi - 1e-6, 2 * pi + 1e-3, 10.0])
+@each("angle", [4.0, 2 * pi - 1e-6, 2 * pi + 1e-3, 10.0])
 def test_log_gives_the_short_way_round(angle: float) -> None:
     for phi in vectors(angle):
         np.testing.assert_allclose(so3.log(so3.exp(phi)), Rotation.from_rotvec(phi).as_rotvec(), atol=1e-14)
@@ -119,7 +120,7 @@ def test_right_jacobian(angle: float) -> None:
         )
 
 
-@pytest.mark.parametrize("angle", [angle for angle in ANGLES if angle <= pi - 1e-3])
+@each("angle", [angle for angle in ANGLES if angle <= pi - 1e-3])
 def test_inverse_jacobians_are_derivatives_of_the_log(angle: float) -> None:
     for phi in vectors(angle):
         R = so3.exp(phi)
@@ -148,9 +149,7 @@ def test_laws(angle: float) -> None:
         np.testing.assert_allclose(R, np.eye(3) + so3.hat(phi) @ left, atol=4e-15)
 
 
-@pytest.mark.parametrize(
-    "x", [0.0, 1e-300, 1e-12, 1e-6, 1e-3, np.nextafter(0.01, 0), 0.01, np.nextafter(0.01, 1), 1.0, pi**2]
-)
+@each("x", [0.0, 1e-300, 1e-12, 1e-6, 1e-3, np.nextafter(0.01, 0), 0.01, np.nextafter(0.01, 1), 1.0, pi**2])
 def test_coefficients_keep_their_digits(x: float) -> None:
     for k, found in enumerate(so3.jacobian_coefficients(x)):
         expected = term = 1 / np.prod(np.arange(1, k + 2, dtype=np.longdouble))
@@ -161,7 +160,7 @@ def test_coefficients_keep_their_digits(x: float) -> None:
         assert found == pytest.approx(float(expected), rel=1e-15 * (3 if k < 2 else 3 / min(max(x, 0.01), 1.0)))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@each("seed", range(5))
 def test_closest_rotation_is_that_of_the_wahba_problem(seed: int):
     rng = np.random.default_rng(seed)
     b = rng.normal(size=(6, 3))

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.errors import CalibrationError, RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Tag, Target
@@ -14,7 +15,7 @@ from icalib.geometry.targets.families import FAMILIES, family_name, opencv_bits,
 GRID = AprilGrid(rows=6, cols=7, tag_size=0.088, tag_spacing=0.3)  # not square, so that rows and columns differ
 
 
-@pytest.mark.parametrize(("row", "col"), [(0, 0), (0, 6), (1, 0), (3, 4), (5, 6)])
+@each(("row", "col"), [(0, 0), (0, 6), (1, 0), (3, 4), (5, 6)])
 def test_tags_run_row_major_and_corners_around(row: int, col: int) -> None:
     origin = np.array([col * 0.1144, row * 0.1144, 0.0])
     around = 0.088 * np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -35,7 +36,7 @@ def test_index_accepts_small_integers() -> None:
     np.testing.assert_array_equal(GRID.point_index(tags, np.array([3], dtype=np.int8)), [167])
 
 
-@pytest.mark.parametrize("tag", [-1, 42, 587])
+@each("tag", [-1, 42, 587])
 def test_unknown_tag(tag: int) -> None:
     with pytest.raises(RecordingError, match=rf"tag {tag} is not on the target \(6 x 7 tags, ids 0 to 41\)"):
         GRID.point_index(np.array([0, tag, 3]), np.array([0, 1, 2]))
@@ -55,7 +56,7 @@ SCENE = Scene(("grid", "tags"), (GRID, TAGS))
 AMBIGUOUS = Scene(("grid", "tags", "board"), (GRID, TAGS, BOARD))
 
 
-@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS, SCENE], ids=lambda t: t.type)
+@each("target", [GRID, CHARUCO, BOARD, TAG, TAGS, SCENE])
 def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Target):
     index = np.arange(len(target.points))
     np.testing.assert_array_equal(target.point_index(*target.point_identity(index)), index)
@@ -65,8 +66,8 @@ def test_identities_and_indices_are_inverse_and_the_origin_is_point_0(target: Ta
     assert (target.tag_centers != target.points).any() == target.blooms
 
 
-@pytest.mark.parametrize("target", [GRID, CHARUCO, BOARD, TAG, TAGS], ids=lambda t: t.type)
-@pytest.mark.parametrize("rows", [5, 7])
+@each("target", [GRID, CHARUCO, BOARD, TAG, TAGS])
+@each("rows", [5, 7])
 def test_corners_of_a_tag_have_its_number_alone_and_in_a_scene(target: Target, rows: int):
     tag, _ = target.point_identity(np.arange(len(target.points)))
     expected = tag if target.type in ("aprilgrid", "tag", "markers") else np.arange(len(tag))
@@ -90,7 +91,7 @@ def test_checkerboard_runs_row_by_row_from_the_bottom_left():
     np.testing.assert_allclose(BOARD.points[[1, 9, 53]], [[0.03, 0, 0], [0, 0.03, 0], [0.24, 0.15, 0]])
 
 
-@pytest.mark.parametrize(("rows", "cols", "symmetric"), [(6, 9, False), (6, 8, True), (7, 9, True), (6, 6, True)])
+@each(("rows", "cols", "symmetric"), [(6, 9, False), (6, 8, True), (7, 9, True), (6, 6, True)])
 def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
     """Colours of the squares, the board turned by half a turn."""
     black = np.indices((rows + 1, cols + 1)).sum(axis=0) % 2 == 0
@@ -103,9 +104,7 @@ def test_symmetry_of_a_checkerboard(rows: int, cols: int, symmetric: bool):
     assert not CHARUCO.symmetric and not GRID.symmetric
 
 
-@pytest.mark.parametrize(
-    ("rows", "cols", "quarters"), [(6, 8, (0, 2)), (7, 7, (0, 2)), (6, 6, (0, 1, 2, 3)), (6, 7, (0,))]
-)
+@each(("rows", "cols", "quarters"), [(6, 8, (0, 2)), (7, 7, (0, 2)), (6, 6, (0, 1, 2, 3)), (6, 7, (0,))])
 def test_turns_of_a_checkerboard_put_points_on_points(rows: int, cols: int, quarters: tuple[int, ...]):
     """Every turn by a multiple of 90 degrees about the middle that puts black on black, and no other."""
     board = Checkerboard(rows, cols, 0.03)
@@ -127,7 +126,7 @@ def test_tag_corners_run_counterclockwise_from_the_bottom_left():
     np.testing.assert_allclose(TAG.tag_centers, [[0.1, 0.1, 0.0]] * 4)
 
 
-@pytest.mark.parametrize(
+@each(
     ("target", "tag_id", "corner", "words"),
     [
         (CHARUCO, 0, 24, "corner 24 is not on the target (corners 0 to 23); check squares_x and squares_y"),
@@ -147,7 +146,7 @@ def test_points_that_a_target_lacks(target: Target, tag_id: int, corner: int, wo
     assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@each(
     ("make", "words"),
     [
         (lambda: Charuco(7, 5, 0.04, 0.04, "5x5_100"), "marker_size 0.04 does not fit a square of 0.04"),
@@ -176,7 +175,7 @@ def test_families_are_opencvs():
         assert tag_bits(family, count - 1).shape == (bits, bits)
 
 
-@pytest.mark.parametrize(
+@each(
     ("text", "name"),
     [
         ("tag36h11", "tag36h11"),
@@ -198,7 +197,7 @@ def test_spellings_of_one_family(text: str, name: str):
     assert Charuco(3, 3, 0.04, 0.03, text).dictionary == name
 
 
-@pytest.mark.parametrize("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
+@each("text", ["tagStandard41h12", "tagCircle21h7", "5x5", "", "36h12", "aruco_36h12"])
 def test_families_that_there_are_not(text: str):
     with pytest.raises(RigError, match=f"no tag family '{text}'.*; available are 4x4_50, .*tag36h11"):
         family_name(text)

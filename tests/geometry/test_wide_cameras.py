@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import sqrt
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 
@@ -29,7 +29,7 @@ def test_limits_are_the_pinhole() -> None:
         relative_to_pinhole("omni-radtan", [0.0, *radtan], radtan)
 
 
-@pytest.mark.parametrize("xi", [0.2, 1.0, 2.5])
+@each("xi", [0.2, 1.0, 2.5])
 def test_three_models_share_the_unified_one(xi: float) -> None:
     """Geyer's model: Mei without distortion, EUCM with beta = 1 and double sphere with xi = 0."""
     alpha = xi / (1.0 + xi)
@@ -67,7 +67,7 @@ def test_the_ranges_are_those_of_the_papers() -> None:
         np.testing.assert_array_equal(found, points[:, 2] > -min(mirror, 1.0 / mirror) * d)
 
 
-@pytest.mark.parametrize("name", CAMERA_MODELS)
+@each("name", CAMERA_MODELS)
 def test_any_parameters_are_finite_and_no_crash(name: str) -> None:
     """Far outside the domain too: what an estimate may try on its way."""
     model, rng = camera_model(name), np.random.default_rng(2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-import pytest
+from tests.cases import each
 
 from icalib.errors import EstimationError
 from icalib.initialize.rig_guess import explained_failure
@@ -29,7 +29,7 @@ def test_relative_poses_that_would_work_as_absolute_ones_are_named():
     assert str(found).startswith("odom: ") and "write kind: absolute" in str(found)
 
 
-@pytest.mark.parametrize(
+@each(
     ("rig", "make", "failed"),
     [
         (RELATIVE, failing, BROKEN),

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from icalib.initialize.rate_correlation import GyroRotation
+from tests.cases import each
 
 from icalib.geometry import so3
-from icalib.initialize.rate_correlation import GyroRotation
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_keyframes
 
@@ -22,8 +23,8 @@ def gyro() -> GyroRotation:
     return GyroRotation.integrate(imu, np.zeros(3))
 
 
-@pytest.mark.parametrize("offset", [0.0, OFFSET_S])
-@pytest.mark.parametrize("method", ["carry", "smoothed"])
+@each("offset", [0.0, OFFSET_S])
+@each("method", ["carry", "smoothed"])
 def test_rounding_of_stamps_moves_nothing(gyro: GyroRotation, method: str, offset: float):
     """Poses at 20 Hz with noise: readings lie halfway between two, and poses at the ends of a window."""
     rng, t = np.random.default_rng(0), offset + np.arange(0.5, 3.5, 0.05)
@@ -38,8 +39,8 @@ def test_rounding_of_stamps_moves_nothing(gyro: GyroRotation, method: str, offse
     np.testing.assert_allclose(at(rounded), at(t), atol=1e-9)
 
 
-@pytest.mark.parametrize("scheme", ["inertial", "pose"])
-@pytest.mark.parametrize("share", [0.5, 1.0])
+@each("scheme", ["inertial", "pose"])
+@each("share", [0.5, 1.0])
 def test_rounding_assigns_no_other_keyframe(scheme, share: float):
     """Instants halfway between two keyframes, and at keyframes."""
     keyframes = np.arange(0.0, 3.0, 0.05) + OFFSET_S

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
@@ -38,7 +39,7 @@ def asked_for(sentence: str, sensor: ImuSensor) -> ImuSensor:
     return replace(sensor, **{field: tuple(entries.split(", "))})
 
 
-@pytest.mark.parametrize(
+@each(
     ("gyro", "accel", "words"),
     [
         (XYZ, ("-x", "-y", "-z"), "has an inverted accelerometer, which reads -g at rest"),

@@ -6,6 +6,9 @@ import dataclasses
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.initialize.intrinsics import guess_intrinsics
+from icalib.sensors.camera.initialize.target_poses import FlatPoints, target_poses
+from tests.cases import each
 from tests.typed import instance, not_none
 
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
@@ -13,8 +16,6 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Parameter, Rig
-from icalib.sensors.camera.initialize.intrinsics import guess_intrinsics
-from icalib.sensors.camera.initialize.target_poses import FlatPoints, target_poses
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess, initial_trajectory
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 
@@ -92,7 +93,7 @@ def stills_of(model: str, intrinsics: tuple[float, ...], distortion: tuple[float
     return CornerStream("cam0", stream.stamps_ns[kept], start, stream.point[rows], stream.uv[rows]), scenario.target
 
 
-@pytest.mark.parametrize("wanted", ["omni-radtan", "double-sphere", "pinhole-equidistant"])
+@each("wanted", ["omni-radtan", "double-sphere", "pinhole-equidistant"])
 def test_lenses_that_see_all_round_are_found_in_few_images(wanted: str):
     """Errors are told in pixels of the image: on the plane z = 1 those far from the axis seem ten times as large."""
     stream, target = stills_of("double-sphere", (339.0, 338.0, 647.0, 405.0), (-0.05, 0.73), 18)
@@ -125,7 +126,7 @@ def test_a_camera_without_a_pose_is_refused_in_a_sentence(simulation: Simulation
         initial_guess(rig, m)
 
 
-@pytest.mark.parametrize("seconds", [0.037, 1000.037, -5.0])
+@each("seconds", [0.037, 1000.037, -5.0])
 def test_a_shifted_clock_shifts_the_offset_alone(simulation: Simulation, seconds: float):
     rig = rig_for(simulation.scenario)
     plain = initial_guess(rig, simulation.measurements)
@@ -302,7 +303,7 @@ def test_a_focal_length_is_found_where_all_trials_explain_the_corners_alike():
     np.testing.assert_allclose(found, scenario.cameras[0].intrinsics, atol=1.0)
 
 
-@pytest.mark.parametrize("length", [0.3, 0.8, 3.0])
+@each("length", [0.3, 0.8, 3.0])
 def test_a_gap_in_the_imu_spoils_no_guess(length: float):
     scenario = dataclasses.replace(handheld(12.0), imu_gaps=((5.0, 5.0 + length),))
     simulation = simulate(scenario, 2)

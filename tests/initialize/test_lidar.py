@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.initialize.initializer import KnownExtrinsics
+from tests.cases import each
 from tests.typed import not_none, random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.initializer import KnownExtrinsics
-from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
+from icalib.sensors.lidar.initialize.association import lidar_and_motion, lidar_on_motion
 
 pytestmark = pytest.mark.slow
 
@@ -66,7 +67,7 @@ def test_any_orientation_and_clocks_far_apart(robot, seed):
     assert within(r, lidar_on_motion(r.imu, r.streams[0], known), 2.0, 0.15, 5e-3)
 
 
-@pytest.mark.parametrize("lidar", [{"rate_hz": 5.0}, {"rate_hz": 20.0, "azimuth_steps": 400}, {"range_m": (0.5, 5.0)}])
+@each("lidar", [{"rate_hz": 5.0}, {"rate_hz": 20.0, "azimuth_steps": 400}, {"range_m": (0.5, 5.0)}])
 def test_other_lidars(robot, lidar):
     r = robot(16.0, 2, lidar)
     assert within(r, lidar_and_motion(r.imu, r.streams[0], 9.81)[0], 0.5, 0.05, 1e-3)
@@ -83,7 +84,7 @@ def test_on_a_floor_the_turn_about_its_axis_comes_from_accelerations(robot):
     assert within(r, lidar_and_motion(r.imu, r.streams[0], 9.81)[0], 1.0, 0.05, 1e-3, but=up)
 
 
-@pytest.mark.parametrize(("seconds", "seed"), [(8.0, 96), (12.0, 6), (12.0, 19)])
+@each(("seconds", "seed"), [(8.0, 96), (12.0, 6), (12.0, 19)])
 def test_a_long_turn_to_one_side_shows_the_clocks(robot, seconds, seed):
     """About its median such a turn is another motion, which goes best with the LiDAR's seconds away or nowhere."""
     r = robot(seconds, seed, {"azimuth_steps": 300}, example="table2-planar")
@@ -92,7 +93,7 @@ def test_a_long_turn_to_one_side_shows_the_clocks(robot, seconds, seed):
     assert abs(found.offset - r.truth().offset) < 5e-3
 
 
-@pytest.mark.parametrize("seed", [5, 6, 11, 12])
+@each("seed", [5, 6, 11, 12])
 def test_on_a_floor_the_turn_about_its_axis_comes_from_the_known_motion(robot, seed):
     """Which way that motion is for the LiDAR must not be taken from the turn that is looked for."""
     r = robot(20.0, seed, example="table2-planar")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes import count_directions, normal_shares
@@ -23,7 +24,7 @@ def seeing(stream: LidarStream, faces: list[int]) -> LidarStream:
     return LidarStream(stream.name, stream.stamps_ns, start, stream.offset_s[own], stream.xyz[own], stream.plane[own])
 
 
-@pytest.mark.parametrize(
+@each(
     ("faces", "count"),
     [([0], 1), ([3], 1), ([0, 1], 1), ([2, 3], 1), ([0, 2], 2), ([0, 4, 5], 2), ([2, 4], 2), ([0, 2, 4], 3), ([], 0)],
 )
@@ -32,7 +33,7 @@ def test_of_parts_of_a_room(free_robot, faces, count):
     assert n_directions(seeing(free_robot.streams[0], faces)) == count
 
 
-@pytest.mark.parametrize("example", ["table2-planar", "table2-ramp", "straight-line"])
+@each("example", ["table2-planar", "table2-ramp", "straight-line"])
 def test_of_whole_rooms(robot, example):
     assert n_directions(robot(6.0, 1, example=example).streams[0]) == 3
 

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.initialize.rate_correlation import GyroRotation
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.rate_correlation import GyroRotation
 from icalib.initialize.trajectories import ImuTrajectory, SignalIntegrals, system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
 from icalib.sensors.lidar.initialize.odometry import (
@@ -298,8 +299,8 @@ def expected_rows(e: PosePrediction, pose: ScanPose) -> np.ndarray:
     )
 
 
-@pytest.mark.parametrize("knows_way", [False, True])
-@pytest.mark.parametrize("knows_turn", [False, True])
+@each("knows_way", [False, True])
+@each("knows_turn", [False, True])
 def test_what_is_expected_of_a_pose_is_in_the_normal_equations(knows_turn: bool, knows_way: bool):
     rng = np.random.default_rng(3)
     slow = np.array([1.0, 0.01, 1.0])[:, None]  # turns little: the slope of the logarithm is taken for one

@@ -7,11 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import specs_of, tolerance_of
+from icalib.estimate.solver import minimise
+from tests.cases import each
 
 from icalib.errors import EstimationError
-from icalib.estimate.inputs import specs_of, tolerance_of
 from icalib.estimate.problem import Problem
-from icalib.estimate.solver import minimise
 from icalib.initialize.trajectories import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.poses import EstimatedMotion, place_keyframes
@@ -20,8 +21,14 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, check_shares, round_search
-from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
+from icalib.sensors.lidar.initialize.association import (
+    ASSOCIATION_ROUNDS,
+    associate,
+    check_shares,
+    lidar_and_motion,
+    lidar_on_motion,
+    round_search,
+)
 from icalib.sensors.lidar.residual import LidarFactor
 
 pytestmark = pytest.mark.slow
@@ -177,9 +184,7 @@ def test_many_recordings(robot, example, turn, way, late, wrong):
         assert table.max(axis=1).sum() > (1.0 - wrong) * table.sum()
 
 
-@pytest.mark.parametrize(
-    ("shares", "lost"), [((0.15, 0.07, 0.06), True), ((0.1, 0.5, 0.9), False), ((0.1, 0.09), False)]
-)
+@each(("shares", "lost"), [((0.15, 0.07, 0.06), True), ((0.1, 0.5, 0.9), False), ((0.1, 0.09), False)])
 def test_planes_that_get_lost_from_round_to_round_are_an_error(shares: tuple[float, ...], lost: bool):
     with pytest.raises(EstimationError, match="lidar0.*15%, then 6%") if lost else nullcontext():
         check_shares(shares, "lidar0")

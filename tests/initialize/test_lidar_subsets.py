@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.motion.point_planes import PlaneAssociation
@@ -28,7 +29,7 @@ def empty(n: int) -> LidarStream:
     )
 
 
-@pytest.mark.parametrize("step", [1, 3, 5, 13])
+@each("step", [1, 3, 5, 13])
 def test_what_was_found_of_some_points_is_put_where_they_were(step):
     """Of two recordings, of which the second does not begin with a point that was looked at."""
     number = np.arange(23, dtype=np.int32)
@@ -51,6 +52,7 @@ def test_steps_are_odd_and_long_enough():
         assert step % 2 == 1 and points <= step * association.MOST_POINTS
 
 
+@pytest.mark.full
 def test_the_result_is_that_of_all_points(robot, monkeypatch):
     """Of two recordings, of which a seventh is looked at beforehand."""
     sims = [robot(10.0, seed, {"azimuth_steps": 600}).sim for seed in (1, 2)]

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
-from icalib.estimate.inputs import inputs_for
 from icalib.optim.state import State
 from icalib.sensors.pose.initialize import pose_values, state_from_poses
 from icalib.sensors.pose.simulate import SimPoses
@@ -73,7 +74,7 @@ WRONG = [
 ]
 
 
-@pytest.fixture(scope="module", params=[1, 2])
+@pytest.fixture(scope="module", params=[1, pytest.param(2, marks=pytest.mark.full)])
 def sim(request):
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.from_rotvec([2.0, -0.5, 1.0]).as_matrix(), [0.1, -0.2, 0.15]
@@ -91,7 +92,7 @@ def state_of(sim) -> State:
     return State(keyframes, R, p, v, np.tile(bias, (len(keyframes), 1)), {("imu0", "intrinsics"): np.zeros(24)})
 
 
-@pytest.mark.parametrize(("way", "words"), WRONG)
+@each(("way", "words"), WRONG)
 def test_written_another_way(sim, way, words):
     written = sim.measurements.with_streams(*(way(x) for x in sim.measurements.poses))
     inputs = inputs_for(rig_for(sim.scenario), [written])

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.initialize.hand_eye import PosePairs, hand_eye, unexplained_motion
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
-from icalib.initialize.hand_eye import PosePairs, hand_eye, unexplained_motion
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.sensors.pose.initialize.conventions import Convention, best_convention, with_checked_convention
@@ -59,12 +60,12 @@ def unexplained(folder: Path, rows: np.ndarray, sensor: PoseSensor) -> float:
     return with_checked_convention(checked_poses(read, sensor, "here")[0], sensor, place)
 
 
-@pytest.mark.parametrize(("rows", "fields"), PRINTED)
+@each(("rows", "fields"), PRINTED)
 def test_each_is_read_through_fields(tmp_path, rows, fields):
     assert unexplained(tmp_path, rows, pose_sensor(**fields)) < 0.01
 
 
-@pytest.mark.parametrize(("rows", "fields"), PRINTED)
+@each(("rows", "fields"), PRINTED)
 def test_the_fields_that_fit_are_named(tmp_path, rows, fields):
     with pytest.raises(EstimationError, match=r"for it in the rig file\.$") as error:
         unexplained(tmp_path, rows, pose_sensor())
@@ -101,7 +102,7 @@ def test_a_convention_must_explain_the_motion_and_have_no_rival(tmp_path):
     assert best_convention([one, two], [0.02, 0.021], 0.1) is None
 
 
-@pytest.mark.parametrize("written", ["xyz", ["xyz", "turns"], "euler", ["vector"]])
+@each("written", ["xyz", ["xyz", "turns"], "euler", ["vector"]])
 def test_an_unknown_way_to_write_rotations(written):
     with pytest.raises(Exception, match=r"rotations: must be xyzw or wxyz .*correct it"):
         pose_sensor(rotations=written)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-
 from icalib.initialize.smooth_trajectory import (
     MIN_HALF_WINDOW_S,
     rate_window,
@@ -13,6 +11,8 @@ from icalib.initialize.smooth_trajectory import (
     smooth_trajectory,
     window_rates,
 )
+from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):
@@ -27,7 +27,7 @@ def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):
     return t, noisy.as_matrix(), w
 
 
-@pytest.mark.parametrize(("hz", "noise"), [(100.0, 1e-3), (30.0, 9e-3), (10.0, 2e-2)])
+@each(("hz", "noise"), [(100.0, 1e-3), (30.0, 9e-3), (10.0, 2e-2)])
 def test_the_noise_of_rotations_is_found(hz, noise):
     _, R, _ = turning(hz, noise)
     assert rotation_noise(R) == pytest.approx(noise, rel=0.15)

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.sensors.lidar.initialize import self_returns
-from icalib.sensors.lidar.initialize.self_returns import _NearPoints, self_returns_of, without_self_returns
+from icalib.sensors.lidar import initialize
+from icalib.sensors.lidar.initialize import _NearPoints, self_returns_of, without_self_returns
 
 pytestmark = pytest.mark.slow
 
@@ -42,8 +43,8 @@ PANELS = {
 }
 
 
-@pytest.mark.parametrize("panel", PANELS.values(), ids=list(PANELS))
-@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+@each("panel", PANELS.values())
+@each("example", ["table2-3d", "table2-planar", "table2-ramp"])
 def test_points_on_the_robot_are_found(robot, example, panel):
     stream, hit = with_panel(robot(16.0, 1, {"azimuth_steps": 300}, example=example).streams[0], *panel)
     own = self_returns_of(stream)
@@ -51,7 +52,7 @@ def test_points_on_the_robot_are_found(robot, example, panel):
     assert own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
 
 
-@pytest.mark.parametrize(
+@each(
     ("example", "changes"),
     [("table2-planar", {"range_m": (0.5, 5.0)}), ("straight-line", {}), ("standing", {}), ("table2-planar", {})],
 )
@@ -65,15 +66,15 @@ def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
 
 def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
-    monkeypatch.setattr(self_returns, "MIN_SHARE_FROM_FAR", 2.0)
+    monkeypatch.setattr(initialize, "MIN_SHARE_FROM_FAR", 2.0)
     assert self_returns_of(stream) is not None
 
 
 def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
     """And the robot is found in all of it."""
-    monkeypatch.setattr(self_returns, "MAX_SEARCHED_SCANS", 70)
+    monkeypatch.setattr(initialize, "MAX_SEARCHED_SCANS", 70)
     whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
-    assert len(whole.stamps_ns) > 1.5 * self_returns.MAX_SEARCHED_SCANS
+    assert len(whole.stamps_ns) > 1.5 * initialize.MAX_SEARCHED_SCANS
     stream, hit = with_panel(whole, *PANELS["panel ahead"])
     own = self_returns_of(stream)
     assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01

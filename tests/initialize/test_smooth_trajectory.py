@@ -1,10 +1,9 @@
 """Parabolas through poses, against motions whose derivatives are known."""
 
 import numpy as np
-import pytest
-from scipy.spatial.transform import Rotation
-
 from icalib.initialize.smooth_trajectory import smooth_trajectory
+from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 TURN = np.array([0.3, -1.2, 2.0])  # rad/s
 
@@ -39,7 +38,7 @@ def test_rates_are_those_of_the_body_where_the_axis_turns():
     np.testing.assert_allclose(path.rate, rate, atol=0.01)
 
 
-@pytest.mark.parametrize("step", [0.01, 0.05, 0.2])
+@each("step", [0.01, 0.05, 0.2])
 def test_noise_is_smoothed_and_gaps_are_known(step):
     rng = np.random.default_rng(1)
     t = np.arange(0.0, 30.0, step)

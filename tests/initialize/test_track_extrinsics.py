@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for
+from icalib.initialize.initializer import joined_states
+from icalib.sensors.camera.initialize.epipolar import MIN_POINT_RANGE_M, _ray_errors, ray_derivatives
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import not_none
-from threadpoolctl import threadpool_limits
 
 from icalib.errors import EstimationError
-from icalib.estimate.inputs import inputs_for
 from icalib.geometry.cameras import camera_model
-from icalib.initialize.initializer import joined_states
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
 from icalib.sensors.camera.initialize import track_camera_values
-from icalib.sensors.camera.initialize.epipolar import MIN_POINT_RANGE_M, _ray_errors, ray_derivatives
 from icalib.tools.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow
@@ -48,8 +48,7 @@ def drive(example="table2-planar", cameras=1, seed=1, noise_px=0.0, duration_s=2
 
 
 def placed(simulation, state, rig):
-    with threadpool_limits(limits=1, user_api="blas"):  # as in a calibration: on many small matrices threads only wait
-        return track_camera_values(inputs_for(rig, [simulation.measurements]), state)
+    return track_camera_values(inputs_for(rig, [simulation.measurements]), state)
 
 
 def true_rig(simulation):
@@ -67,7 +66,7 @@ def errors(simulation, values, name):
     return turn, values[name, "translation"] - T[:3, 3], offset
 
 
-@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+@each("example", ["table2-3d", "table2-planar", "table2-ramp"])
 def test_a_camera_with_a_known_lens_is_found_where_it_is(example):
     simulation, state = drive(example)
     turn, arm, offset = errors(simulation, placed(simulation, state, true_rig(simulation)), "cam0")
@@ -77,7 +76,7 @@ def test_a_camera_with_a_known_lens_is_found_where_it_is(example):
     assert abs(offset) < 5e-5
 
 
-@pytest.mark.parametrize("example", ["table2-3d", "table2-planar", "table2-ramp"])
+@each("example", ["table2-3d", "table2-planar", "table2-ramp"])
 def test_a_rough_lens_is_found_with_the_camera(example):
     """A focal length guessed to 3 %, no distortion, where it is -0.28; the principal point is not sought."""
     simulation, state = drive(example, cameras=3, noise_px=1.0)

@@ -7,6 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.sensors.camera.initialize.epipolar import direction_for_rotation, rotation_information
+from icalib.sensors.camera.initialize.joint_alignment import track_rates
+from icalib.sensors.camera.initialize.track_intrinsics import find_intrinsics
+from tests.cases import each
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
@@ -15,9 +19,6 @@ from icalib.geometry.targets import NoTarget
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
-from icalib.sensors.camera.initialize.epipolar import direction_for_rotation, rotation_information
-from icalib.sensors.camera.initialize.joint_alignment import track_rates
-from icalib.sensors.camera.initialize.track_intrinsics import find_intrinsics
 from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 
@@ -79,7 +80,7 @@ def off_px(simulation: Simulation, lens: np.ndarray) -> float:
     return float(np.sqrt(((model.project(true, turned)[0] - uv) ** 2).sum(axis=1).mean()))
 
 
-@pytest.mark.parametrize("lens", LENSES)
+@each("lens", LENSES)
 def test_every_model_is_found(lens: str):
     """To 3 mrad: half a pixel of a fisheye lens, two of a long one."""
     simulation = drive(lens)
@@ -87,7 +88,7 @@ def test_every_model_is_found(lens: str):
     assert off_px(simulation, found) < 3e-3 * model.central_scale(found)
 
 
-@pytest.mark.parametrize(
+@each(
     ("example", "noise_px", "most_px"),
     [("table2-3d", 0.0, 0.7), ("table2-planar", 1.0, 3.0), ("table2-ramp", 1.0, 3.0), ("single-axis", 0.3, 3.0)],
 )
@@ -123,7 +124,12 @@ def test_tracks_of_another_drive_do_not_match():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("lens", "seed", "longest_s"),
-    [("radtan", 1, 5.0), ("radtan", 2, 0.25), ("fisheye", 3, 0.5), ("double sphere", 4, 5.0)],
+    [
+        pytest.param("radtan", 1, 5.0, marks=pytest.mark.full),
+        ("radtan", 2, 0.25),
+        ("fisheye", 3, 0.5),
+        pytest.param("double sphere", 4, 5.0, marks=pytest.mark.full),
+    ],
 )
 def test_calibration_from_nothing(lens: str, seed: int, longest_s: float):
     """Also where points are lost after five or ten images."""

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.estimate.inputs import inputs_for
+from icalib.initialize.rate_correlation import ChainedRates, max_rate_step, offsets_by_angle
 
 from icalib.data.measurements import CornerStream, PoseStream
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import EstimationError
-from icalib.estimate.inputs import inputs_for
 from icalib.geometry import so3
-from icalib.initialize.rate_correlation import ChainedRates, max_rate_step, offsets_by_angle
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Wheels
 from icalib.sensors.pose.simulate import SimPoses
@@ -35,7 +35,7 @@ def thinned(stream, every: int):
     return replace(stream, stamps_ns=stream.stamps_ns[kept], start=start, point=stream.point[rows], uv=stream.uv[rows])
 
 
-@pytest.mark.parametrize("every", [5, 20])
+@pytest.mark.parametrize("every", [pytest.param(5, marks=pytest.mark.full), 20])
 def test_a_camera_of_4_and_1_images_a_second(every):
     simulation = simulate(handheld(30.0), 2)
     m, rig = simulation.measurements, rig_for(simulation.scenario)
@@ -72,7 +72,7 @@ def load_pose_scenario():
     )
 
 
-@pytest.mark.parametrize("every", [25, 50])
+@pytest.mark.parametrize("every", [pytest.param(25, marks=pytest.mark.full), 50])
 def test_poses_once_or_twice_a_second(with_poses, every):
     m, rig = with_poses.measurements, rig_for(with_poses.scenario)
     sensor = replace(rig.poses[0], rotation=Parameter(), translation=Parameter(), time_offset=Parameter())

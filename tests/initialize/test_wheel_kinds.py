@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
@@ -48,7 +49,7 @@ def test_steered_wheels_are_exact_without_noise():
     np.testing.assert_allclose(got, [RADIUS, BASE, OFFSET], rtol=1e-6)
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "values", "words"),
     [
         ("twist", TWIST * [3.6, 1.0] * SCALES, "its forward speed must be in m/s, not km/h"),
@@ -81,8 +82,8 @@ def rates_at(kind, values, offset):
     return wheel_rates("wheel0", at - offset, integral[np.round((at - 3.0) * 1000).astype(int)], kind)
 
 
-@pytest.mark.parametrize(("kind", "values"), [("twist", TWIST), ("steered", STEERED)])
-@pytest.mark.parametrize("offset", [2.9123, -11.37])
+@each(("kind", "values"), [("twist", TWIST), ("steered", STEERED)])
+@each("offset", [2.9123, -11.37])
 def test_the_offset_is_found(kind, values, offset):
     """Of steered wheels tan is what counts, and it is not straight between the readings here."""
     found = wheel_offset(imu(), UP, "wheel0", rates_at(kind, values, offset))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
@@ -83,7 +84,7 @@ def test_without_noise_the_drive_is_exact():
     assert np.linalg.det(found.extrinsics.R) > 0.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@each("seed", range(3))
 def test_with_noise_it_is_good_enough_to_start_from(seed):
     """Velocities to 2 cm/s, wheels to 0.1 rad/s over 0.1 s."""
     turn, p, radii, baseline = differences(guess(path(), 0.02, 0.1, seed))
@@ -115,7 +116,7 @@ def rates_of(p):
     return np.diff(p.angles[::step], axis=0) / 0.1, p.rate[:-step:step], p.velocity[:-step:step]
 
 
-@pytest.mark.parametrize(
+@each(
     ("change", "sentence"),
     [
         (lambda wheel: wheel[:, ::-1], "swapped"),
@@ -131,7 +132,7 @@ def test_wheels_mixed_up_are_named(change, sentence):
     assert str(raised.value).startswith("wheel0: ")
 
 
-@pytest.mark.parametrize(
+@each(
     ("changes", "sentence"),
     [
         ({"turn": 0.0}, "too little"),
@@ -165,7 +166,7 @@ def stamped(p, offset, hz=50.0, first=3.0, last=37.0):
     return at - offset, angles
 
 
-@pytest.mark.parametrize("offset", [3.0, 2.9123, -11.37, 0.0041])
+@each("offset", [3.0, 2.9123, -11.37, 0.0041])
 def test_the_offset_is_found_whatever_the_clocks_origins(offset):
     p = path()
     seconds, angles = stamped(p, offset)

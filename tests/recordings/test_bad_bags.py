@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.bags import Ros1Storage
@@ -52,7 +53,7 @@ def bag_file(path: Path) -> Path:
 
 
 class TestCutOff:
-    @pytest.mark.parametrize("form", CUTTABLE)
+    @each("form", CUTTABLE)
     def test_what_is_readable_is_used_and_a_note_says_how_much(self, form, tmp_path, truth, write):
         path = bag_file(write.small(form, tmp_path, truth))
         whole = path.read_bytes()
@@ -172,7 +173,7 @@ class TestCutOff:
 
 
 class TestDamaged:
-    @pytest.mark.parametrize("form", CUTTABLE)
+    @each("form", CUTTABLE)
     def test_any_byte_may_be_wrong(self, form, tmp_path, truth, write):
         """Whatever is written over, there are messages, or a sentence, and never another error."""
         path = bag_file(write.small(form, tmp_path, truth))
@@ -188,7 +189,7 @@ class TestDamaged:
                 except RecordingError as error:
                     assert "\n" not in str(error)
 
-    @pytest.mark.parametrize("compression", ["NONE", "ZSTD", "LZ4"])
+    @each("compression", ["NONE", "ZSTD", "LZ4"])
     def test_a_damaged_block_is_left_out(self, compression, tmp_path, truth, write):
         path = tmp_path / "run.mcap"
         kind = write.compression[compression]
@@ -237,7 +238,7 @@ class TestNoBag:
             "a.bag is empty; record or copy it again."
         )
 
-    @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap", "a.zip"])
+    @each("name", ["a.bag", "a.db3", "a.mcap", "a.zip"])
     def test_something_else(self, name, tmp_path):
         (tmp_path / name).write_bytes(b"PK\x03\x04 something else")
         sentence = complaint(lambda: open_recording(tmp_path / name))
@@ -353,7 +354,7 @@ class TestImages:
         sentence = complaint(lambda: list(self.bag(tmp_path, write, images).images("/cam")))
         assert f"/cam: the image at {T[7]} ns has 6 x 8 px, others have 8 x 6 px" in sentence
 
-    @pytest.mark.parametrize("odd", [0, 1, 5])
+    @each("odd", [0, 1, 5])
     def test_single_images_of_another_size_are_left_out(self, tmp_path, write, odd):
         images = self.pictures()
         images[odd] = np.ones((8, 6), np.uint8)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import LidarStream
 from icalib.data.recordings import BagRecording
@@ -142,7 +143,7 @@ DRIVERS = {
 }
 
 
-@pytest.mark.parametrize("driver", DRIVERS)
+@each("driver", DRIVERS)
 def test_points_are_timed_as_drivers_write_it(write, read, driver):
     dtype, times, stamp_at, fields, within_ns = DRIVERS[driver]
     found = scans()
@@ -161,8 +162,8 @@ def test_points_on_a_clock_of_their_own(write, read):
     assert len(notes) == 1 and "the point times `timestamp` are from another clock than the message stamps" in notes[0]
 
 
-@pytest.mark.parametrize("direction", [1, -1])
-@pytest.mark.parametrize("order", ["columns", "rows", "organised"])
+@each("direction", [1, -1])
+@each("order", ["columns", "rows", "organised"])
 def test_points_are_timed_by_azimuth(write, read, direction, order):
     """Within the firing of a column; the second message begins with a hole of a quarter of a turn."""
     found = scans(direction)
@@ -264,7 +265,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each("case", REFUSED)
 def test_what_would_be_wrong_is_refused(write, read, case):
     build, fields, words = REFUSED[case]
     with pytest.raises(RecordingError) as error:
@@ -286,8 +287,8 @@ OTHER_UNITS = {
 }
 
 
-@pytest.mark.parametrize("case", OTHER_UNITS)
-@pytest.mark.parametrize("given", [False, True])
+@each("case", OTHER_UNITS)
+@each("given", [False, True])
 def test_the_unit_is_the_one_that_fits(write, read, case, given):
     """How long scans take leaves one unit, which a note names; the rig file may say it."""
     dtype, times, words, unit, within_ns = OTHER_UNITS[case]
@@ -356,7 +357,7 @@ def test_the_rig_file_names_the_field(write, read):
         read(messages, point_time_field="t")
 
 
-@pytest.mark.parametrize(
+@each(
     ("dtype", "times", "lines"),
     [
         (layout(20, laser_usec=("u4", 12)), lambda t, s: {"laser_usec": (t - s) // 1000}, ["laser_usec", "us"]),
@@ -406,8 +407,8 @@ BAD_TIMES = {
 }
 
 
-@pytest.mark.parametrize("case", BAD_TIMES)
-@pytest.mark.parametrize("every", [1, 3, 100])
+@each("case", BAD_TIMES)
+@each("every", [1, 3, 100])
 def test_single_bad_times_are_left_out(write, read, case, every):
     """In one scan of three, or in all: one point in a hundred."""
     dtype, times, field, bad = BAD_TIMES[case]
@@ -449,7 +450,7 @@ def test_bytes_that_are_no_numbers(write, read):
         assert f"1 without numbers, {2 * SCANS} without a time within their scan were left out" in notes[0]
 
 
-@pytest.mark.parametrize("odd", [0, 1, 7, 11])
+@each("odd", [0, 1, 7, 11])
 def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
     make, found = write.maker(), scans()
     messages = packed(make, found, VELODYNE, lambda t, s: {"time": (t - s) * 1e-9})
@@ -459,7 +460,7 @@ def test_a_cloud_of_other_fields_is_left_out(write, read, odd):
     assert f"1 clouds lack fields of the others and were left out, the first at {found.stamps[odd]} ns" in notes[0]
 
 
-@pytest.mark.parametrize("point_time", ["auto", "azimuth", "snapshot"])
+@each("point_time", ["auto", "azimuth", "snapshot"])
 def test_clouds_that_are_all_stamped_alike(write, read, point_time):
     make, found = write.maker(), scans()
     still = Scans(np.full(SCANS, ORIGIN), found.since, found.xyz, found.ring)
@@ -495,7 +496,7 @@ def test_empty_clouds(write, read):
         read(messages)
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"offset": 2**31 - 1},
@@ -521,7 +522,7 @@ def test_fields_that_lie_beyond_a_point(write, read, wrong):
         read([(t, dataclasses.replace(m, fields=messages[3][1].fields)) for t, m in messages])
 
 
-@pytest.mark.parametrize(
+@each(
     "wrong",
     [
         {"width": 2**32 - 1},

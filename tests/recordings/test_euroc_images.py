@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tests.cases import each
 
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
@@ -46,7 +47,7 @@ def test_names_that_are_no_stamps(tmp_path, truth, write):
     assert "cam0 has no data.csv, and the name of left_1.png is not a stamp in ns" in sentence
 
 
-@pytest.mark.parametrize("line", ["12", "12,", "1.5,a.png", "x,a.png"])
+@each("line", ["12", "12,", "1.5,a.png", "x,a.png"])
 def test_line_that_is_none(line, tmp_path, truth, write):
     root = write.euroc(tmp_path, truth)
     table = root / "mav0/cam0/data.csv"
@@ -81,7 +82,7 @@ def test_names_with_another_ending(tmp_path, truth, write):
     assert data.is_dir()
 
 
-@pytest.mark.parametrize("separator", [",", "; ", "\t", " "])
+@each("separator", [",", "; ", "\t", " "])
 def test_a_table_in_other_units(tmp_path, truth, write, separator):
     root = write.euroc(tmp_path, truth)
     files = sorted((root / "mav0/cam0/data").iterdir())

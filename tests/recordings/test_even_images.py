@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import CornerStream, TrackStream
 from icalib.sensors.camera.read.corners import with_even_stamps
@@ -40,8 +41,8 @@ def evened(*streams: CornerStream | TrackStream) -> tuple[list[CornerStream | Tr
     return [s for s, _ in found], tuple(note for _, notes in found for note in notes)
 
 
-@pytest.mark.parametrize("size_ms", [0.2, 1.0, 3.0])
-@pytest.mark.parametrize("delay", ["normal", "exponential", "dropped frames"])
+@each("size_ms", [0.2, 1.0, 3.0])
+@each("delay", ["normal", "exponential", "dropped frames"])
 def test_jitter(even, delay, size_ms):
     """A line through symmetric delays is off by 2 sigma / sqrt(n) at its ends; the envelope of one-sided ones less."""
     rng = np.random.default_rng(2)
@@ -65,7 +66,7 @@ def test_a_clock_that_drifts_stays(even):
     assert len(notes) == 1 and np.std(off) < 2e5
 
 
-@pytest.mark.parametrize("jitter_ms", [0.5, 2.0, 8.0])
+@each("jitter_ms", [0.5, 2.0, 8.0])
 def test_a_camera_that_is_exposed_unevenly_keeps_its_stamps(jitter_ms):
     stream = filmed(jitter_s=1e-3 * jitter_ms)
     (found,), notes = evened(stream)

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.bags import bag_files
@@ -60,7 +61,7 @@ def complaint(call) -> str:
     return sentence
 
 
-@pytest.mark.parametrize("form", FORMS)
+@each("form", FORMS)
 def test_streams_are_those_that_were_written(form, tmp_path, truth, write):
     recording = open_recording(write.small(form, tmp_path, truth))
     for camera, step in ((CAM0, 1), (CAM1, -1)):
@@ -77,7 +78,7 @@ def test_streams_are_those_that_were_written(form, tmp_path, truth, write):
     assert checked_imu(instance(imu, ImuStream), recording.where(IMU))[1] == ()
 
 
-@pytest.mark.parametrize("form", FORMS[:-1])
+@each("form", FORMS[:-1])
 def test_what_is_left_half_read_is_closed_by_any_thread(form, tmp_path, truth, write):
     """Garbage is collected in the thread that happens to make some."""
     recording = open_recording(write.small(form, tmp_path, truth))
@@ -88,7 +89,7 @@ def test_what_is_left_half_read_is_closed_by_any_thread(form, tmp_path, truth, w
         pool.submit(messages.close).result()
 
 
-@pytest.mark.parametrize("form", FORMS[:-1])
+@each("form", FORMS[:-1])
 def test_topics_of_a_bag(form, tmp_path, truth, write):
     topics = {t.name: t for t in open_recording(write.small(form, tmp_path, truth)).topics()}
     assert list(topics) == ["/cam0/image_raw", "/cam1/compressed", "/imu0"]
@@ -165,7 +166,7 @@ def test_a_folder_of_tables_beside_its_bag_is_tables(tmp_path, truth, write):
     assert not isinstance(open_recording(tmp_path), BagRecording)
 
 
-@pytest.mark.parametrize("form", ["ros1", "ros2", "mcap", "mcap without chunks"])
+@each("form", ["ros1", "ros2", "mcap", "mcap without chunks"])
 def test_memory_does_not_grow_with_the_recording(form, tmp_path, write):
     maker = write.maker("ros1" if form == "ros1" else "ros2")
     writer = {"ros1": write.ros1, "ros2": write.ros2}.get(form, write.mcap)

@@ -7,6 +7,7 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.images import file_payload, file_size
 from icalib.data.recordings import DamagedImageError, Payload, decode
@@ -27,16 +28,16 @@ def raw(encoding: str, pixels: np.ndarray, padding: int = 0, big_endian: bool = 
     return Payload(5, "run.bag /cam", encoding, rows.tobytes(), width, height, rows.shape[1], big_endian)
 
 
-@pytest.mark.parametrize("padding", [0, 3])
-@pytest.mark.parametrize("encoding", ["mono8", "8UC1"])
+@each("padding", [0, 3])
+@each("encoding", ["mono8", "8UC1"])
 def test_grey_is_itself(encoding, padding):
     image = decode(raw(encoding, GREY, padding))
     assert image.dtype == np.uint8 and image.flags.c_contiguous and image.flags.writeable
     np.testing.assert_array_equal(image, GREY)
 
 
-@pytest.mark.parametrize("padding", [0, 5])
-@pytest.mark.parametrize(
+@each("padding", [0, 5])
+@each(
     ("encoding", "channels"),
     [("rgb8", [0, 1, 2]), ("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])],
 )
@@ -45,9 +46,9 @@ def test_colour_is_luma(encoding, channels, padding):
     np.testing.assert_allclose(image, LUMA, atol=1.0)
 
 
-@pytest.mark.parametrize("big_endian", [False, True])
-@pytest.mark.parametrize("padding", [0, 4])
-@pytest.mark.parametrize(("darkest", "brightest"), [(0, 200), (0, 1023), (0, 65535), (29_000, 29_300)])
+@each("big_endian", [False, True])
+@each("padding", [0, 4])
+@each(("darkest", "brightest"), [(0, 200), (0, 1023), (0, 65535), (29_000, 29_300)])
 def test_sixteen_bits_are_stretched(darkest, brightest, padding, big_endian):
     pixels = RNG.integers(darkest, brightest + 1, (H, W)).astype(np.uint16)
     pixels[2, 3], pixels[0, 1] = brightest, darkest
@@ -69,9 +70,7 @@ def test_single_hot_and_dead_pixels_take_no_grey_levels(dtype):
     assert not decode(file_payload(5, "x", cv2.imencode(".tiff", np.full_like(pixels, 7))[1].tobytes())).any()
 
 
-@pytest.mark.parametrize(
-    ("ending", "encoding"), [(".bmp", "bmp"), (".tif", "tiff"), (".pgm", "pnm"), (".ppm", "pnm"), (".webp", "webp")]
-)
+@each(("ending", "encoding"), [(".bmp", "bmp"), (".tif", "tiff"), (".pgm", "pnm"), (".ppm", "pnm"), (".webp", "webp")])
 def test_other_files(ending, encoding):
     image = COLOUR[..., ::-1] if ending != ".pgm" else LUMA.round().astype(np.uint8)
     options = [cv2.IMWRITE_WEBP_QUALITY, 101] if ending == ".webp" else []
@@ -81,7 +80,7 @@ def test_other_files(ending, encoding):
     np.testing.assert_allclose(decode(payload), LUMA, atol=1.5)
 
 
-@pytest.mark.parametrize("order", ["rggb", "bggr", "gbrg", "grbg"])
+@each("order", ["rggb", "bggr", "gbrg", "grbg"])
 def test_mosaic_of_one_colour_is_its_luma(order):
     """The name of an encoding is its first row and its second: rggb has red at (0, 0), blue at (1, 1)."""
     colour = {"r": 200, "g": 90, "b": 20}
@@ -95,7 +94,7 @@ def test_mosaic_of_one_colour_is_its_luma(order):
     np.testing.assert_array_equal(decode(packed), image)
 
 
-@pytest.mark.parametrize(("encoding", "first"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
+@each(("encoding", "first"), [("yuv422", 1), ("uyvy", 1), ("yuv422_yuy2", 0), ("yuyv", 0)])
 def test_luma_of_yuv(encoding, first):
     pixels = RNG.integers(0, 256, (H, W, 2), dtype=np.uint8)
     np.testing.assert_array_equal(decode(raw(encoding, pixels)), pixels[:, :, first])
@@ -105,7 +104,7 @@ def test_step_of_zero_is_a_row_without_padding():
     np.testing.assert_array_equal(decode(dataclasses.replace(raw("mono8", GREY), step=0)), GREY)
 
 
-@pytest.mark.parametrize("described", ["png", "bgr8; png compressed bgr8", "", "jpeg"])
+@each("described", ["png", "bgr8; png compressed bgr8", "", "jpeg"])
 def test_png_is_told_by_its_content(described):
     payload = file_payload(5, "x", cv2.imencode(".png", COLOUR[..., ::-1])[1].tobytes(), described)
     assert (payload.encoding, payload.width, payload.height) == ("png", W, H)
@@ -136,7 +135,7 @@ def test_png_of_sixteen_bits():
     np.testing.assert_allclose(decode(payload), pixels / 4095.0 * 255.0, atol=6.0)
 
 
-@pytest.mark.parametrize("encoding", ["32FC1", "", "h264", "compresseddepth"])
+@each("encoding", ["32FC1", "", "h264", "compresseddepth"])
 def test_unknown_encoding(encoding):
     with pytest.raises(RecordingError, match=r"/cam: the image at 5 ns has the encoding '.*'.*one of .*mono8"):
         decode(raw(encoding, GREY))
@@ -151,13 +150,13 @@ def test_unknown_file(described, encoding):
         decode(payload)
 
 
-@pytest.mark.parametrize("change", [{"height": H + 1}, {"width": W + 1}, {"step": W + 1}, {"height": 0}, {"data": b""}])
+@each("change", [{"height": H + 1}, {"width": W + 1}, {"step": W + 1}, {"height": 0}, {"data": b""}])
 def test_too_few_bytes(change):
     with pytest.raises(DamagedImageError, match=r"/cam: the image at 5 ns has \d+ bytes, too few for .* px of mono8"):
         decode(dataclasses.replace(raw("mono8", GREY), **change))
 
 
-@pytest.mark.parametrize("data", [b"\xff\xd8\xff\xe0 rubbish", b"\x89PNG\r\n\x1a\n", b"\x89PNG\r\n\x1a\n" + 40 * b"\0"])
+@each("data", [b"\xff\xd8\xff\xe0 rubbish", b"\x89PNG\r\n\x1a\n", b"\x89PNG\r\n\x1a\n" + 40 * b"\0"])
 def test_damaged_file(data):
     with pytest.raises(DamagedImageError, match="the image at 5 ns is damaged"):
         decode(file_payload(5, "x", data, "jpeg"))

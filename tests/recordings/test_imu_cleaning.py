@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.data.stamps import EvenStamps, even_stamps, followed
@@ -32,8 +33,8 @@ def is_left(found: ImuStream, imu: ImuStream) -> np.ndarray:
     return np.isin(imu.stamps_ns, found.stamps_ns)
 
 
-@pytest.mark.parametrize("noiseless", [False, True])
-@pytest.mark.parametrize("seed", [2, 3])
+@each("noiseless", [False, True])
+@each("seed", [2, 3])
 def test_clean_readings_stay_bit_for_bit(seed, noiseless):
     imu = simulated(seed, noiseless=noiseless)
     found, notes = checked_imu(imu, "file")
@@ -51,8 +52,8 @@ def test_the_note_names_time_and_count(waved):
     assert f"the first 3.500 s from the start, at {waved.stamps_ns[700]} ns" in notes[0]
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("size", [8.0, 20.0, 1e3, 1e28])
+@each("seed", range(4))
+@each("size", [8.0, 20.0, 1e3, 1e28])
 def test_one_reading_of_a_hundred_is_wrong(waved, seed, size):
     """Those next to each other, too; and none but these is left out."""
     rng = np.random.default_rng(seed)
@@ -68,7 +69,7 @@ def test_one_reading_of_a_hundred_is_wrong(waved, seed, size):
     assert left[~wrong].all() and not left[wrong][2:-2].any()
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@each("value", [np.nan, np.inf, -np.inf])
 def test_readings_that_are_no_numbers(waved, value):
     gyro = waved.gyro.copy()
     gyro[[0, 40, 41, -1], 2] = value
@@ -77,7 +78,7 @@ def test_readings_that_are_no_numbers(waved, value):
     assert "4 of 2001 readings are not finite" in notes[0]
 
 
-@pytest.mark.parametrize("width", [0.004, 0.006, 0.01, 0.03])
+@each("width", [0.004, 0.006, 0.01, 0.03])
 def test_shocks_stay(waved, width):
     """Blows of 60 m/s^2, and of 6 rad/s, as long as a low-pass filter of an IMU makes them at least."""
     blows = np.arange(0.513, 9.8, 0.2037)
@@ -105,8 +106,8 @@ def test_a_sensor_that_is_stuck_for_a_while(waved):
     assert np.flatnonzero(~is_left(found, waved)).tolist() == list(range(500, 530)), notes
 
 
-@pytest.mark.parametrize("shift_ns", [-3_000_000, -8_000_000, 2_000_000, 12_000_000])
-@pytest.mark.parametrize("share", [0.02, 0.25, 0.5])
+@each("shift_ns", [-3_000_000, -8_000_000, 2_000_000, 12_000_000])
+@each("share", [0.02, 0.25, 0.5])
 def test_copies_under_other_stamps(waved, shift_ns, share):
     """As a T265 sends them; the originals are told by their even stamps."""
     again = np.random.default_rng(0).random(len(waved.gyro)) < share
@@ -146,8 +147,8 @@ class TestEvenStamps:
             imu.stamps_ns, lambda number, delay: followed(number, delay, np.zeros(n), np.arange(n), values)
         )
 
-    @pytest.mark.parametrize("burst", [2, 5, 10, 32])
-    @pytest.mark.parametrize("within_ns", [0, 1000, 100_000])
+    @each("burst", [2, 5, 10, 32])
+    @each("within_ns", [0, 1000, 100_000])
     def test_bursts(self, waved, burst, within_ns):
         """Each stamp is that of its burst's last reading, and so many ns more; the sampling clock comes back."""
         k = np.arange(len(waved.gyro))

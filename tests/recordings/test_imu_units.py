@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import RecordingError
@@ -59,8 +60,8 @@ def at_rest(waved: ImuStream) -> ImuStream:
     return replace(waved, gyro=rng.normal(0, 2e-3, (n, 3)), accel=[0.3, 0.2, 9.8] + rng.normal(0, 0.02, (n, 3)))
 
 
-@pytest.mark.parametrize("rest", [False, True])
-@pytest.mark.parametrize("degrees", [False, True])
+@each("rest", [False, True])
+@each("degrees", [False, True])
 def test_units_of_g_are_recognised(waved, rest, degrees):
     imu = at_rest(waved) if rest else waved
     unit = 180.0 / np.pi if degrees else 1.0
@@ -75,7 +76,7 @@ def test_units_of_g_against_the_rig_file(waved):
         checked_imu(replace(waved, accel=waved.accel / G), "file", replace(IMU, accel_unit="m/s^2"))
 
 
-@pytest.mark.parametrize("size", [0.02, 0.3, 1.0])
+@each("size", [0.02, 0.3, 1.0])
 def test_gravity_taken_off_is_named(waved, size):
     """At any size, that of units of g too."""
     linear = waved.accel - gravity_of(waved)
@@ -84,7 +85,7 @@ def test_gravity_taken_off_is_named(waved, size):
         checked_imu(replace(waved, accel=linear), "file", IMU)
 
 
-@pytest.mark.parametrize("factor", [1000.0, 1000.0 / G, 3.28084, 1 / 3.0])
+@each("factor", [1000.0, 1000.0 / G, 3.28084, 1 / 3.0])
 def test_other_units_are_refused(waved, factor):
     with pytest.raises(RecordingError, match="far from gravity.*accel_unit"):
         checked_imu(replace(waved, accel=factor * waved.accel), "file", IMU)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.measurements import (
     CornerStream,
@@ -115,7 +116,7 @@ def shifted(stream, index: int, by: int):
     return dataclasses.replace(stream, stamps_ns=stamps)
 
 
-@pytest.mark.parametrize("which", ["imu", "cameras", "both"])
+@each("which", ["imu", "cameras", "both"])
 def test_a_jump_does_not_move_the_result(simulation, which):
     m: Measurements = simulation.measurements
     rig = rig_for(simulation.scenario)
@@ -153,8 +154,15 @@ def test_commands_that_read_an_imu_alone(tmp_path: Path):
     assert isinstance(FolderRecording(tmp_path).stamps("imu0/data.csv"), np.ndarray)
 
 
-@pytest.mark.parametrize("which", ["imu", "cameras"])
-@pytest.mark.parametrize("index", [500, 1400])
+@pytest.mark.parametrize(
+    ("which", "index"),
+    [
+        ("imu", 500),
+        ("cameras", 1400),
+        pytest.param("imu", 1400, marks=pytest.mark.full),
+        pytest.param("cameras", 500, marks=pytest.mark.full),
+    ],
+)
 def test_a_clock_that_is_set_by_seconds_is_named(simulation, which, index):
     m, by = simulation.measurements, 3 * 10**9
     at = m.imu.stamps_ns[index]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.recordings import FolderRecording, read_measurements
@@ -55,10 +56,8 @@ def check(table, stamps=STAMPS) -> None:
 SEPARATORS = {",": ",", ";": ";", "tab": "\t", " ": " ", "blanks": "   ", ", ": ", "}
 
 
-@pytest.mark.parametrize("name", SEPARATORS)
-@pytest.mark.parametrize(
-    "head", ["", "t{0}wx{0}wy{0}wz{0}ax{0}ay{0}az\n", "# a comment\n# t{0}wx{0}wy{0}wz{0}ax{0}ay{0}az\n"]
-)
+@each("name", SEPARATORS)
+@each("head", ["", "t{0}wx{0}wy{0}wz{0}ax{0}ay{0}az\n", "# a comment\n# t{0}wx{0}wy{0}wz{0}ax{0}ay{0}az\n"])
 def test_separators(tmp_path, name, head):
     separator = SEPARATORS[name]
     table, notes = read(tmp_path, head.format(separator) + rows(separator))
@@ -73,7 +72,7 @@ def test_decimal_commas_beside_semicolons(tmp_path):
 ACCEL_FIRST = VALUES[:, [3, 4, 5, 0, 1, 2]]
 
 
-@pytest.mark.parametrize(
+@each(
     "names",
     [
         "timestamp,ax,ay,az,wx,wy,wz",
@@ -141,8 +140,8 @@ def written(stamps: np.ndarray, power: int, digits: int) -> list[str]:
     return out
 
 
-@pytest.mark.parametrize("unit", ["s", "ms", "us"])
-@pytest.mark.parametrize("origin", [ORIGIN, 41_234_567, 0], ids=["1970", "boot", "zero"])
+@each("unit", ["s", "ms", "us"])
+@each("origin", [ORIGIN, 41_234_567, 0])
 def test_units_of_stamps_are_told_by_their_rate(tmp_path, unit, origin):
     words, power = UNITS[unit]
     stamps = origin + STEP * np.arange(N)
@@ -176,7 +175,7 @@ def test_bursts_and_jumps_do_not_change_the_unit():
     assert unit_of_stamps(jumped / 1000, 10.0, 20_000.0) == "us"
 
 
-@pytest.mark.parametrize(
+@each(
     ("step", "count", "rate_hz", "unit"),
     [
         (33, 900, (1e-3, 1000.0), "ms"),  # 30 s at 30 Hz, and not eight hours
@@ -306,7 +305,7 @@ def split_rows(name: str, stamps: np.ndarray = STAMPS, before: str = "") -> str:
     )
 
 
-@pytest.mark.parametrize("name", SPLIT)
+@each("name", SPLIT)
 def test_seconds_and_nanoseconds_in_two_columns(tmp_path, name):
     table, notes = read(tmp_path, split_rows(name))
     check(table)

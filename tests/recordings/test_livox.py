@@ -11,6 +11,7 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from tests.cases import each
 
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
@@ -48,9 +49,9 @@ def bag_of(path: Path, package: str, form: str, frame: str, cut: int = 0) -> Bag
     return BagRecording(path)
 
 
-@pytest.mark.parametrize("package", ["livox_ros_driver", "livox_ros_driver2"])
-@pytest.mark.parametrize("form", ["ros1", "ros2"])
-@pytest.mark.parametrize("frame", ["", "f", "livox_frame", "livox_frames"])
+@each("package", ["livox_ros_driver", "livox_ros_driver2"])
+@each("form", ["ros1", "ros2"])
+@each("frame", ["", "f", "livox_frame", "livox_frames"])
 def test_points_and_their_times(tmp_path, package, form, frame):
     bag = bag_of(tmp_path / "run.bag", package, form, frame)
     assert [(t.kind, t.count) for t in bag.topics()] == [("points", SCANS)]
@@ -61,8 +62,8 @@ def test_points_and_their_times(tmp_path, package, form, frame):
     assert bag.notes() == ()
 
 
-@pytest.mark.parametrize("form", ["ros1", "ros2"])
-@pytest.mark.parametrize("cut", [1, 25, 150])
+@each("form", ["ros1", "ros2"])
+@each("cut", [1, 25, 150])
 def test_a_message_that_is_cut_off(tmp_path, form, cut):
     bag = bag_of(tmp_path / "run.bag", "livox_ros_driver2", form, "f", cut)
     with pytest.raises(RecordingError, match=f"/livox/lidar: the message received at {ORIGIN + 10} ns is damaged"):

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
@@ -50,9 +51,9 @@ NAMES = {
 }
 
 
-@pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("place", ["cam0", "cam0/data"])
-@pytest.mark.parametrize("first", [0, 1, 7])
+@each("name", NAMES)
+@each("place", ["cam0", "cam0/data"])
+@each("first", [0, 1, 7])
 def test_as_many_pictures_as_poses(tmp_path, name, place, first):
     """In order; ten comes after nine whatever the names' alphabetical order is."""
     pictures(tmp_path / place, [NAMES[name](k) for k in range(first, first + 12)])
@@ -91,9 +92,9 @@ def test_a_row_that_is_no_pose_counts_as_one(tmp_path):
     assert len(pose_readings(open_recording(tmp_path), HAND).stamps_ns) == 19
 
 
-@pytest.mark.parametrize("kept", [range(12), [0, 1, 2, 5, 8, 9, 11]])
-@pytest.mark.parametrize("bad", [0, 5, 11])
-@pytest.mark.parametrize("stamp", ["", "x17", "nan", "9" * 25])
+@each("kept", [range(12), [0, 1, 2, 5, 8, 9, 11]])
+@each("bad", [0, 5, 11])
+@each("stamp", ["", "x17", "nan", "9" * 25])
 def test_a_row_whose_stamp_cannot_be_read_leaves_its_picture_alone(tmp_path, kept, bad, stamp):
     """All other pictures keep their rows, paired in order or by number."""
     pictures(tmp_path / "cam0", [f"{k}.png" for k in kept])
@@ -130,9 +131,9 @@ def test_parts_of_a_stamp_that_cannot_be_read(tmp_path):
     assert found == [k for k in range(12) if k != 4]
 
 
-@pytest.mark.parametrize("unit", ["ms", "us", "s"])
-@pytest.mark.parametrize("place", ["hand/poses.csv", "arm/flange.csv"])
-@pytest.mark.parametrize("split", [False, True])
+@each("unit", ["ms", "us", "s"])
+@each("place", ["hand/poses.csv", "arm/flange.csv"])
+@each("split", [False, True])
 def test_stamps_are_read_as_the_rig_file_describes_the_poses(tmp_path, unit, place, split):
     """The stamp is not the first column, no name of it is known, and its rate would be one in nanoseconds, too."""
     pictures(tmp_path / "cam0", [f"{k}.png" for k in range(8)])

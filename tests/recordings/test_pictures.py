@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import ImuStream
@@ -74,7 +75,7 @@ def test_wrong_names_are_said(tmp_path):
         next(iter(PictureFolder(tmp_path).payloads("b/*.png")))
 
 
-@pytest.mark.parametrize(
+@each(
     ("left", "right", "names"),
     [
         ("left{}.png", "right{}.png", ("left", "right")),
@@ -82,7 +83,7 @@ def test_wrong_names_are_said(tmp_path):
         ("{:03d}_cam0.pgm", "{:03d}_cam1.pgm", None),
     ],
 )
-@pytest.mark.parametrize("folder", ["", "images"])
+@each("folder", ["", "images"])
 def test_pictures_of_two_cameras_in_one_folder(tmp_path, left, right, names, folder):
     for i in range(9, 13):
         picture(tmp_path / folder / left.format(i), 10 + i)
@@ -114,7 +115,7 @@ def test_single_pictures_that_are_odd_are_left_out_and_named(tmp_path):
         assert f"{reason} were left out, the first {name}.png." in notes
 
 
-@pytest.mark.parametrize(
+@each(
     ("names", "odd"),
     [
         ("IMG_000{}.png", "preview.png"),
@@ -165,7 +166,7 @@ NAMES = {
 }
 
 
-@pytest.mark.parametrize("unit", NAMES)
+@each("unit", NAMES)
 def test_names_that_are_stamps(tmp_path, unit):
     digits = {"ms": 1_000_000, "us": 1000}.get(unit, 1)
     for k, name in enumerate(NAMES[unit]):

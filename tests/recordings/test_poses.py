@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 
 from icalib.data.measurements import PoseStream
 from icalib.data.recordings import BagRecording, FolderRecording, open_recording, read_measurements
@@ -92,7 +93,7 @@ def test_tums_text(tmp_path):
         assert pose_readings(FolderRecording(tmp_path), sensor).stamps_ns.tolist() == [ns]
 
 
-@pytest.mark.parametrize("line", ["1.0 2 3 4 0 0 0", "1.0 2 3 4 0 0 0 x", "1.0 2 3 nan 0 0 0 1", "a 2 3 4 0 0 0 1"])
+@each("line", ["1.0 2 3 4 0 0 0", "1.0 2 3 4 0 0 0 x", "1.0 2 3 nan 0 0 0 1", "a 2 3 4 0 0 0 1"])
 def test_a_bad_line_of_tums_text_is_named(tmp_path, line):
     (tmp_path / "mocap0").mkdir()
     (tmp_path / "mocap0" / "poses.txt").write_text(f"0.5 2 3 4 0 0 0 1\n{line}\n")
@@ -188,9 +189,9 @@ LOST = {
 }
 
 
-@pytest.mark.parametrize("case", LOST)
-@pytest.mark.parametrize("sensor", [ABSOLUTE, RELATIVE], ids=["absolute", "relative"])
-@pytest.mark.parametrize("far", [[0.0, 0.0, 0.0], [465_000.0, 5_248_000.0, 413.0]], ids=["near", "far"])
+@each("case", LOST)
+@each("sensor", [ABSOLUTE, RELATIVE])
+@each("far", [[0.0, 0.0, 0.0], [465_000.0, 5_248_000.0, 413.0]])
 def test_lost_poses_are_left_out(case, sensor, far):
     """A tracker that is lost reports the origin, or no position and no rotation at all."""
     lost, rng = LOST[case], np.random.default_rng(0)
@@ -230,7 +231,7 @@ def test_bad_poses_between_jumps_that_stay():
 SMALL = np.array([9, 40, 42, 150, 222, 290])
 
 
-@pytest.mark.parametrize("what", ["3 cm", "3 deg", "50 m"])
+@each("what", ["3 cm", "3 deg", "50 m"])
 def test_single_wrong_poses(what):
     """Far below a jump, with noise of 1 mm and 2 mrad."""
     rng, n = np.random.default_rng(3), len(SMALL)
@@ -247,8 +248,8 @@ def test_single_wrong_poses(what):
     assert f"{n} of {N} poses are outliers of the trajectory" in notes[0] and f"the first at {STAMPS[9]} ns" in notes[0]
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-3])
-@pytest.mark.parametrize("every", [1, 5])
+@each("noise", [0.0, 1e-3])
+@each("every", [1, 5])
 def test_starts_and_stops_are_no_wrong_poses(noise, every):
     """An odometry that mostly stands still, and starts and stops within one pose, at 50 and 10 Hz."""
     moving = np.arange(N) % 60 > 45
@@ -259,7 +260,7 @@ def test_starts_and_stops_are_no_wrong_poses(noise, every):
     assert len(stream.stamps_ns) == N
 
 
-@pytest.mark.parametrize("copies", [np.arange(100, 120), np.arange(1, N, 4), np.array([33, 150, 151])])
+@each("copies", [np.arange(100, 120), np.arange(1, N, 4), np.array([33, 150, 151])])
 def test_poses_that_are_sent_again(copies):
     """A tracker that freezes, a driver with a faster clock than the tracker, single late copies."""
     source = np.arange(N)
@@ -355,7 +356,7 @@ def test_brisk_motion_is_no_jump(tmp_path):
     assert read(tmp_path)[1] == ()
 
 
-@pytest.mark.parametrize("kind", ["PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry"])
+@each("kind", ["PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry"])
 def test_bags(tmp_path, write, kind):
     make = write.maker("ros2")
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.sensors.imu.assess import quiet_scatter
 
@@ -15,8 +16,8 @@ def readings(density: float, seconds: float = 20.0, rate: float = RATE) -> tuple
     return t, motion + density * np.sqrt(rate) * np.random.default_rng(1).normal(size=motion.shape)
 
 
-@pytest.mark.parametrize("density", [1e-4, 1e-2])
-@pytest.mark.parametrize("rate", [100.0, 200.0, 1000.0])
+@each("density", [1e-4, 1e-2])
+@each("rate", [100.0, 200.0, 1000.0])
 def test_it_is_that_of_white_noise_whatever_the_motion(density, rate):
     t, x = readings(density, rate=rate)
     assert 0.8 * density < quiet_scatter(t, x) < 1.05 * density

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.data.measurements import CornerStream, Measurements
@@ -243,7 +244,7 @@ class TestCorners:
         assert f"the image at {ORIGIN + IMAGE_STEP} ns has corner 2 of tag 0 twice" in sentence
         assert "cam0/corners.csv" in sentence
 
-    @pytest.mark.parametrize(("column", "value", "words"), [(1, 36, "tag 36"), (1, -1, "tag -1"), (2, 4, "corner 4")])
+    @each(("column", "value", "words"), [(1, 36, "tag 36"), (1, -1, "tag -1"), (2, 4, "corner 4")])
     def test_not_on_the_target(self, tmp_path, column, value, words):
         rows = corner_rows()
         rows[17][column] = value
@@ -252,7 +253,7 @@ class TestCorners:
         assert f"in the image at {ORIGIN + 2 * IMAGE_STEP} ns, {words} is not" in sentence
         assert "cam0/corners.csv" in sentence
 
-    @pytest.mark.parametrize(("u", "v"), [(-1.6, 0.0), (752.6, 0.0), (0.0, 480.6), (0.0, -1.6)])
+    @each(("u", "v"), [(-1.6, 0.0), (752.6, 0.0), (0.0, 480.6), (0.0, -1.6)])
     def test_outside_the_image(self, tmp_path, u, v):
         rows = corner_rows()
         for row in rows[9:14]:
@@ -261,7 +262,7 @@ class TestCorners:
         assert f"corner 1 of tag 0 lies at ({u}, {v}), outside the image of 752 x 480 px; check" in sentence
         assert f"{ORIGIN + IMAGE_STEP} ns" in sentence
 
-    @pytest.mark.parametrize(("u", "v"), [(-1.6, 0.0), (1e9, 200.0), (100.0, -1e300), (-4.2e4, 9e9)])
+    @each(("u", "v"), [(-1.6, 0.0), (1e9, 200.0), (100.0, -1e300), (-4.2e4, 9e9)])
     def test_single_corners_outside_the_image_are_left_out(self, tmp_path, u, v):
         rows = corner_rows()
         rows[9][3:] = rows[17][3:] = [u, v]

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from icalib.data.recording import Reading
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.recording import Reading
@@ -132,8 +134,8 @@ def metres():
     return np.stack([np.deg2rad(d[:, 1]) * east, np.deg2rad(d[:, 0]) * north, d[:, 2]], axis=1)
 
 
-@pytest.mark.parametrize("form", ["ros1", "ros2"])
-@pytest.mark.parametrize("kind", KINDS)
+@each("form", ["ros1", "ros2"])
+@each("kind", KINDS)
 def test_messages_of_receivers(tmp_path, write, kind, form):
     stream, notes = stream_of(bag(write, tmp_path, kind, KINDS[kind], form))
     np.testing.assert_allclose(stream.stamps_ns, STAMPS, atol=0)
@@ -196,7 +198,7 @@ def test_navsat_fixes_go_first(tmp_path, write):
     assert "navpvt" not in draft
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_drafts_of_receivers(tmp_path, write, kind):
     path = bag(write, tmp_path, kind, KINDS[kind], others=imu())
     draft = draft_rig(inspect_recording(path))

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.cli import main
 from icalib.data.measurements import LidarStream
@@ -62,7 +63,7 @@ def test_points_that_cannot_be_used(tmp_path):
     assert "2 of 5 scans have no usable point" in notes[1]
 
 
-@pytest.mark.parametrize(
+@each(
     ("changed", "words"),
     [
         ({"xyz": None}, "has no array xyz; it needs stamps_ns, start, offset_s, xyz"),
@@ -87,14 +88,14 @@ def test_what_is_refused(tmp_path, changed, words):
     assert str(tmp_path / "lidar0" / "scans.npz") in str(error.value)
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
+@each(("unit", "factor"), [("ms", 1e3), ("us", 1e6), ("ns", 1e9)])
 def test_the_unit_of_times_is_the_one_that_fits(tmp_path, unit, factor):
     stream, notes = read(tmp_path, GOOD | {"offset_s": GOOD["offset_s"] * factor})
     np.testing.assert_allclose(stream.offset_s, GOOD["offset_s"], rtol=1e-6)
     assert f"they are read as {unit}, the only unit that fits" in notes[0]
 
 
-@pytest.mark.parametrize("bad", [np.nan, 4.29, -3e20])
+@each("bad", [np.nan, 4.29, -3e20])
 def test_single_bad_times(tmp_path, bad):
     offset_s = GOOD["offset_s"].copy()
     offset_s[[5, 60, 199]] = bad
@@ -126,8 +127,8 @@ def expect(stream: LidarStream, scans: list[int]):
     assert stream.start.tolist() == [10 * k for k in range(len(scans) + 1)]
 
 
-@pytest.mark.parametrize("late", [0, 1, 2])
-@pytest.mark.parametrize("delay_ns", [0, 10**7, 3 * 10**8])
+@each("late", [0, 1, 2])
+@each("delay_ns", [0, 10**7, 3 * 10**8])
 def test_copies_of_scans_are_dropped(tmp_path, late, delay_ns):
     """With the stamp of the first or with a later one, at once or after other scans."""
     order = np.insert(np.arange(24), [8 + late, 15 + late], [7, 14])
@@ -146,7 +147,7 @@ def test_scans_that_overtook_each_other_are_sorted(tmp_path):
     assert "scans are out of order" in notes[0] and len(notes) == 1
 
 
-@pytest.mark.parametrize("stamp_ns", [0, 10**18 + 5 * 10**10, 10**18 + 12 * 10**8, 10**18 + 3 * 10**8, 2**62])
+@each("stamp_ns", [0, 10**18 + 5 * 10**10, 10**18 + 12 * 10**8, 10**18 + 3 * 10**8, 2**62])
 def test_a_scan_with_a_wrong_stamp_is_left_out(tmp_path, stamp_ns):
     arrays = scan_of(np.arange(24))
     arrays["stamps_ns"][7] = stamp_ns
@@ -158,8 +159,8 @@ def test_a_scan_with_a_wrong_stamp_is_left_out(tmp_path, stamp_ns):
     )
 
 
-@pytest.mark.parametrize("jitter_ns", [0, 10**6])
-@pytest.mark.parametrize("late_ns", [3 * 10**7, -2 * 10**7])
+@each("jitter_ns", [0, 10**6])
+@each("late_ns", [3 * 10**7, -2 * 10**7])
 def test_a_scan_stamped_too_early_or_too_late_is_left_out(tmp_path, jitter_ns, late_ns):
     arrays = scan_of(np.arange(24))
     arrays["stamps_ns"] += (jitter_ns * np.random.default_rng(0).normal(size=24)).astype(np.int64)
@@ -169,7 +170,7 @@ def test_a_scan_stamped_too_early_or_too_late_is_left_out(tmp_path, jitter_ns, l
     assert "1 of 24 scans are stamped more than 5% of a period too early or too late relative to" in notes[0]
 
 
-@pytest.mark.parametrize("kind", ["late", "lost", "cut at packets"])
+@each("kind", ["late", "lost", "cut at packets"])
 def test_stamps_of_arrival_are_made_even_and_those_of_scans_that_differ_in_length_are_not(tmp_path, kind):
     """Scans that begin with a packet are as long as the time to the next one, so their stamps are true."""
     rng = np.random.default_rng(1)
@@ -194,7 +195,7 @@ def test_stamps_of_arrival_are_made_even_and_those_of_scans_that_differ_in_lengt
         assert "the stamps jitter by" in notes[0] and "made even at 10.00 Hz" in notes[0]
 
 
-@pytest.mark.parametrize("case", ["jitter", "lost", "sector", "uneven"])
+@each("case", ["jitter", "lost", "sector", "uneven"])
 def test_stamps_that_are_no_faults(tmp_path, case):
     """Stamps of a driver that jitters; lost scans; a sector without returns, where a clock of the points begins later;
     scans at two periods by turns."""
@@ -215,8 +216,8 @@ def test_stamps_that_are_no_faults(tmp_path, case):
     assert stream.stamps_ns.tolist() == arrays["stamps_ns"].tolist() and notes == ()
 
 
-@pytest.mark.parametrize("i", [0, 7, 23])
-@pytest.mark.parametrize("stamp_ns", [0, 10**18 + 10**15, 10**18 - 3 * 10**12])
+@each("i", [0, 7, 23])
+@each("stamp_ns", [0, 10**18 + 10**15, 10**18 - 3 * 10**12])
 def test_a_wrong_stamp_is_no_jump_of_the_clock(tmp_path, i, stamp_ns):
     """Nor is it at the ends."""
     arrays = scan_of(np.arange(24))

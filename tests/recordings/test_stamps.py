@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import pytest
+from tests.cases import each
 
 from icalib.data.recordings import open_recording
 from icalib.errors import RecordingError
 
 
-@pytest.mark.parametrize("form", ["ros1", "ros2 sqlite3", "mcap"])
+@each("form", ["ros1", "ros2 sqlite3", "mcap"])
 def test_of_a_bag(form, tmp_path, truth, write):
     recording = open_recording(write.small(form, tmp_path, truth))
     for topic in ("/cam0/image_raw", "/cam1/compressed"):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.tables import TableKind, read_table
 from icalib.errors import RecordingError
@@ -41,7 +42,7 @@ def test_short_decimals_are_exact(tmp_path):
     assert table.decimals[:, 0].tolist() == [float(x) for x in texts]
 
 
-@pytest.mark.parametrize(
+@each(
     "content",
     [
         "t_ns,id,u,v\n1,2,3,4\n",
@@ -64,7 +65,7 @@ def test_gzip_is_told_by_its_content(tmp_path):
 HEAD = "t,id,u,v\n1,2,3,4\n"
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "words"),
     [
         ("", "is empty"),
@@ -97,7 +98,7 @@ def test_what_is_wrong_is_named(tmp_path, content, words):
     assert "a.csv" in str(error.value)
 
 
-@pytest.mark.parametrize("keep", [5, 12, -20, -4])
+@each("keep", [5, 12, -20, -4])
 def test_truncated_gzip(tmp_path, keep):
     whole = gzip.compress("".join(f"{k},2,3.25,4\n" for k in range(1000)).encode())
     with pytest.raises(RecordingError, match=r"a\.csv\.gz is a damaged or truncated gzip file .* copy it again"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RecordingError, RigError
@@ -39,7 +40,7 @@ def test_a_table_is_read(tmp_path):
     np.testing.assert_array_equal(stream.uv, [[10.5, 20.0], [11.0, 21.0], [10.75, 20.25]])
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("1050000000,7", "950000000,7", "the image at 950000000 ns comes after the one at 1000000000 ns; sort"),

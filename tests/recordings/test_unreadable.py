@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mcap.writer import Writer as McapWriter
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import ImuStream
@@ -66,7 +67,7 @@ def bag_of(folder: Path, topic: str, kind: str) -> Path:
     return path
 
 
-@pytest.mark.parametrize("kind", PACKETS)
+@each("kind", PACKETS)
 def test_packets_of_a_lidar(tmp_path, kind):
     path = bag_of(tmp_path, "/lidar/packets", kind)
     words = (
@@ -92,7 +93,7 @@ def test_scans_of_one_plane(tmp_path, kind):
     assert "nav_msgs/Odometry as a sensor of type: pose, kind: relative." in complaint(lambda: scans(bag, LIDAR))
 
 
-@pytest.mark.parametrize("kind", VIDEOS)
+@each("kind", VIDEOS)
 def test_compressed_video(tmp_path, kind):
     path = bag_of(tmp_path, "/cam/video", kind)
     bag = open_recording(path)
@@ -102,12 +103,12 @@ def test_compressed_video(tmp_path, kind):
     assert any("/cam/video holds compressed video" in f.sentence for f in inspect_recording(path).findings)
 
 
-@pytest.mark.parametrize("kind", ["sensor_msgs/msg/Range", "diagnostic_msgs/msg/Packet", "nav_msgs/msg/Path"])
+@each("kind", ["sensor_msgs/msg/Range", "diagnostic_msgs/msg/Packet", "nav_msgs/msg/Path"])
 def test_other_types_are_none_of_these(kind):
     assert type_not_read(kind) is None
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "words"),
     [
         (POINTER, "run `git lfs pull`"),
@@ -115,7 +116,7 @@ def test_other_types_are_none_of_these(kind):
         (MP4, "is a video; give the folder that it lies"),
     ],
 )
-@pytest.mark.parametrize("name", ["a.bag", "a.mcap", "clip.mp4", "folder/a.db3"])
+@each("name", ["a.bag", "a.mcap", "clip.mp4", "folder/a.db3"])
 def test_a_file_that_is_none(tmp_path, content, words, name):
     path = tmp_path / name
     path.parent.mkdir(exist_ok=True)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 
 from icalib.data.recordings import decode, open_recording
 from icalib.errors import RecordingError
@@ -39,7 +40,7 @@ def times(path: Path, n: int, header: str = "") -> np.ndarray:
     return stamps
 
 
-@pytest.mark.parametrize("name", ["cam0.mp4", "cam0.avi", "cam0/video.mp4", "mav0/cam0.mp4"])
+@each("name", ["cam0.mp4", "cam0.avi", "cam0/video.mp4", "mav0/cam0.mp4"])
 def test_frames_are_images_with_the_stamps_of_the_video(tmp_path, name):
     write_video(tmp_path / name)
     recording = open_recording(tmp_path)
@@ -80,7 +81,7 @@ def test_a_table_of_another_length_is_refused(tmp_path, rows, words):
         list(open_recording(tmp_path).payloads("cam0.mp4"))
 
 
-@pytest.mark.parametrize(
+@each(
     ("table", "words"),
     [
         ("100\n150\nlate\n", r"cam0\.csv:3: 'late' has no stamp"),

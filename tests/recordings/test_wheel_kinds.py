@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelStream
@@ -68,7 +69,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each("case", REFUSED)
 def test_what_would_be_wrong_is_refused(tmp_path, case):
     values, fields, words = REFUSED[case]
     with pytest.raises(RecordingError, match=words) as error:
@@ -76,7 +77,7 @@ def test_what_would_be_wrong_is_refused(tmp_path, case):
     assert str(error.value).startswith(str(tmp_path))
 
 
-@pytest.mark.parametrize(
+@each(
     ("values", "column", "fields", "words"),
     [
         (TWIST, 0, {"measures": "twist"}, "the speed stays at 1.24 m/s for 5.98 s .* while the vehicle turns; check"),

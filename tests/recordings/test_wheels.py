@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelStream
@@ -55,8 +56,8 @@ def test_angles(tmp_path):
     assert (stream.sampling, notes) == ("interval-mean", ())
 
 
-@pytest.mark.parametrize("size", [None, 256, 65536])
-@pytest.mark.parametrize("sign", [1, -1])
+@each("size", [None, 256, 65536])
+@each("sign", [1, -1])
 def test_ticks(tmp_path, size, sign):
     """Forwards and backwards; a counter of 8 bits starts anew every 1.6 rad."""
     counts = np.floor(sign * ANGLES * 1000.5 / (2 * np.pi) + 200.0)
@@ -91,7 +92,7 @@ REFUSED = {
 }
 
 
-@pytest.mark.parametrize("case", REFUSED)
+@each("case", REFUSED)
 def test_what_would_be_wrong_is_refused(tmp_path, case):
     values, stamps, fields, words = REFUSED[case]
     with pytest.raises(RecordingError) as error:
@@ -133,7 +134,7 @@ def test_units_and_signs(tmp_path, unit, size):
         from_table(tmp_path, RATES, signs=(1, -1, 1, -1))
 
 
-@pytest.mark.parametrize(("low", "size"), [(-np.pi, 2 * np.pi), (0.0, 2 * np.pi), (-2 * np.pi, 4 * np.pi)])
+@each(("low", "size"), [(-np.pi, 2 * np.pi), (0.0, 2 * np.pi), (-2 * np.pi, 4 * np.pi)])
 def test_angles_that_wrap(tmp_path, low, size):
     wrapped = np.mod(ANGLES - low, size) + low
     whole, _ = from_table(tmp_path, ANGLES, measures="angles")
@@ -153,7 +154,7 @@ def test_angles_that_wrap(tmp_path, low, size):
 WRONG = [30, 31, 120, 200, 299]
 
 
-@pytest.mark.parametrize("size", [3.0, -40.0, 1e12, np.nan])
+@each("size", [3.0, -40.0, 1e12, np.nan])
 def test_single_rates_that_stand_apart(tmp_path, size):
     rates = RATES + 0.05 * np.random.default_rng(0).normal(size=RATES.shape)
     bad = rates.copy()
@@ -170,8 +171,8 @@ def test_single_rates_that_stand_apart(tmp_path, size):
         checked_wheels(WheelReadings("wheel0", STAMPS, bad), wheels, "here")
 
 
-@pytest.mark.parametrize("measures", ["angles", "ticks"])
-@pytest.mark.parametrize("wrong", [[30, 31, 120, 200, 299], [1], [N - 1]])
+@each("measures", ["angles", "ticks"])
+@each("wrong", [[30, 31, 120, 200, 299], [1], [N - 1]])
 def test_single_wrong_counts(tmp_path, measures, wrong):
     """What is turned over the readings that are left is what the wheels turned."""
     fields: dict[str, Any] = {"counts_per_turn": 4096.0} if measures == "ticks" else {}
@@ -226,7 +227,7 @@ def test_the_table_that_is_not_there(tmp_path):
 POSES = "0,10,0.1,1,0,1e-4,0,0,1e-4,0,1e-4\n"
 
 
-@pytest.mark.parametrize(
+@each(
     ("rows", "words"),
     [
         (

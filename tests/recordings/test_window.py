@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.cli import main
@@ -30,7 +31,7 @@ IMU = ImuSensor("imu0", "imu0/data.csv", class_noise("consumer"))
 S = 1_000_000_000
 
 
-@pytest.mark.parametrize("form", ["euroc", "ros1", "ros2 sqlite3", "mcap"])
+@each("form", ["euroc", "ros1", "ros2 sqlite3", "mcap"])
 def test_of_folders_and_bags(form, tmp_path, truth, write):
     path = write.small(form, tmp_path, truth)
     start = truth.imu_stamps[0]
@@ -123,7 +124,7 @@ def test_pictures(tmp_path):
         open_recording(tmp_path, 1.0, 3.0).stamps("left")
 
 
-@pytest.mark.parametrize(
+@each(
     ("start_s", "end_s", "words"),
     [
         (-1.0, inf, "--from must be seconds after the start of the recording, not -1"),

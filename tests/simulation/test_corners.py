@@ -5,10 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.projection import image_velocity, project, visible
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.tools.simulation import SimCamera, handheld, simulate
-from icalib.tools.simulation.projection import image_velocity, project, visible
 
 FISHEYE = SimCamera(
     "cam0", "pinhole-equidistant", (752, 480), (190.0, 191.0, 375.0, 240.0), (0.03, -0.01, 0.004, -0.001), np.eye(4)
@@ -90,7 +91,7 @@ def test_corners_are_projections_at_sensor_time_plus_offset(index):
     assert np.abs(measured - wrong_sign).max() > 1.0
 
 
-@pytest.mark.parametrize("lens", [*WIDE, RATIONAL], ids=lambda c: c.model)
+@each("lens", [*WIDE, RATIONAL])
 def test_recordings_of_wide_lenses_are_exact_too(lens):
     scenario = with_camera(
         handheld(duration_s=1.0, noiseless=True),
@@ -103,7 +104,7 @@ def test_recordings_of_wide_lenses_are_exact_too(lens):
     np.testing.assert_allclose(sim.measurements.cameras[0].uv, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [handheld().cameras[0], RATIONAL, *WIDE], ids=lambda c: c.model)
+@each("camera", [handheld().cameras[0], RATIONAL, *WIDE])
 def test_projection_and_its_directional_derivative(camera):
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-1.0, 1.0, (50, 2)), rng.uniform(0.4, 2.0, (50, 1))], axis=1)
@@ -134,7 +135,7 @@ def test_points_behind_outside_or_beyond_the_fold_are_not_seen():
     np.testing.assert_array_equal(visible(fisheye, points, project(fisheye, points)), [True, False])
 
 
-@pytest.mark.parametrize("camera", [EUCM, SPHERES, MIRROR], ids=lambda c: c.model)
+@each("camera", [EUCM, SPHERES, MIRROR])
 def test_wide_lenses_see_just_as_far_as_their_image_moves_outwards(camera):
     camera = replace(camera, resolution=(100_000, 100_000), intrinsics=(*camera.intrinsics[:2], 5e4, 5e4))
     angles = np.linspace(1e-3, math.pi - 1e-3, 5000)
@@ -167,7 +168,7 @@ def test_bloom_pulls_corners_towards_their_tag():
     np.testing.assert_array_equal(plain.measurements.cameras[1].uv, bloomed.measurements.cameras[1].uv)
 
 
-@pytest.mark.parametrize("bow", [(2e-3, 0.0, 0.0), (0.0, 2e-3, 0.0), (0.0, 0.0, 2e-3)])
+@each("bow", [(2e-3, 0.0, 0.0), (0.0, 2e-3, 0.0), (0.0, 0.0, 2e-3)])
 def test_bow_moves_the_board_towards_the_camera_where_positive(bow):
     scenario = handheld(duration_s=0.5, noiseless=True)
     scenario = replace(scenario, motion=replace(scenario.motion, kind="motionless"))

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.trajectory import Jet
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import RecordingError, RigError
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Drive, Room, hills_of_slope, simulate
-from icalib.tools.simulation.trajectory import Jet
 
 from .conftest import alone, on_ground, turn, wheel_path
 
@@ -51,7 +52,7 @@ def swing_file(tmp_path_factory):
     return write_tum(tmp_path_factory.mktemp("tum") / "swing.tum", seconds + 1.7e9, *swing(seconds))
 
 
-@pytest.mark.parametrize("kind", ["free", "single-axis", *GROUND, "recorded"])
+@each("kind", ["free", "single-axis", *GROUND, "recorded"])
 def test_readings_are_derivatives_of_the_pose(robot, kind, swing_file):
     only_of: dict[str, dict[str, Any]] = {"recorded": {"path": swing_file}, "arc": {"sideslip_deg": 1.0}}
     sim = simulated(robot, kind, **only_of.get(kind, {}))
@@ -68,7 +69,7 @@ def test_readings_are_derivatives_of_the_pose(robot, kind, swing_file):
     np.testing.assert_allclose(np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", GROUND)
+@each("kind", GROUND)
 def test_wheels_do_not_slide(robot, kind):
     sim = simulated(robot, kind)
     t = np.linspace(0.1, 3.9, 200)
@@ -129,8 +130,8 @@ def test_each_motion_is_what_it_is_called(robot):
     assert spread["standing"].max() < 1e-12
 
 
-@pytest.mark.parametrize("kind", ["free", "single-axis", *GROUND])
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@each("kind", ["free", "single-axis", *GROUND])
+@each("seed", [1, 2, 3])
 def test_the_robot_stays_in_its_room_clear_of_the_blocks(robot, kind, seed):
     position = simulated(robot, kind, duration_s=60.0, seed=seed).truth.position
     assert (np.abs(position[:, 0]) < 5.6).all() and (np.abs(position[:, 1]) < 4.6).all()
@@ -167,7 +168,7 @@ def test_a_recorded_motion_goes_through_its_poses(robot, swing_file, tmp_path, f
     np.testing.assert_allclose(middle, [0.0, 0.0, 0.45 * 3.2], atol=2e-2)
 
 
-@pytest.mark.parametrize(
+@each(
     ("content", "words"),
     [
         ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0\n", ":2: the line is not t x y z qx qy qz qw"),

@@ -6,6 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.filming import Interior, RoomRenderer
+from icalib.tools.simulation.projection import project
+from icalib.tools.simulation.rendering import pixel_kernel, shrink, unproject
+from icalib.tools.simulation.room import atlas_of, dead_leaves, distances
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.tools.simulation import (
@@ -20,10 +25,6 @@ from icalib.tools.simulation import (
     film,
     hills_of_slope,
 )
-from icalib.tools.simulation.filming import Interior, RoomRenderer
-from icalib.tools.simulation.projection import project
-from icalib.tools.simulation.rendering import pixel_kernel, shrink, unproject
-from icalib.tools.simulation.room import atlas_of, dead_leaves, distances
 from icalib.tools.simulation.scenario import faults_of
 
 from .conftest import DISTORTED
@@ -93,7 +94,7 @@ def eye_before(room: Room, face: int, spot: np.ndarray, rng: np.random.Generator
             return eye
 
 
-@pytest.mark.parametrize("camera", DISTORTED, ids=lambda c: c.model)
+@each("camera", DISTORTED)
 def test_marks_of_the_texture_are_where_their_surface_is(camera: SimCamera):
     """A spot on each face of a dark room, seen from all sides: its centroid, by the simulator's own projection."""
     room, sigma, rng = Room(SIZE, BLOCKS), 0.016, np.random.default_rng(5)

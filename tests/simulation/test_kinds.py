@@ -6,12 +6,12 @@ import re
 from itertools import combinations
 
 import numpy as np
-import pytest
+from tests.cases import each
 
-from icalib.kinds import inspectors, simulated_kinds
 from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.camera.spec import Camera
-from icalib.tools.simulation.scenario import SimSensor
+from icalib.tools.inspection.facts import inspectors
+from icalib.tools.simulation.scenario import SimSensor, simulated_kinds
 
 OTHERS = [name for name, kind in SENSOR_TYPES.items() if not kind.is_inertial and kind is not Camera]
 
@@ -25,7 +25,7 @@ def test_streams_of_random_numbers_are_apart():
     assert all(abs(a - b) >= 1000 for a, b in combinations(first, 2)) and min(first) >= 1000
 
 
-@pytest.mark.parametrize("kind", OTHERS)
+@each("kind", OTHERS)
 def test_a_kind_declares_what_its_sensors_have(kind: str):
     simulated, inspector = simulated_kinds()[kind], inspectors()[kind]
     assert issubclass(simulated, SimSensor) and simulated.sensor_type == kind
@@ -41,7 +41,7 @@ def test_a_kind_declares_what_its_sensors_have(kind: str):
     assert all(hasattr(sensor, field) for field in simulated.effects.values())
 
 
-@pytest.mark.parametrize("kind", SENSOR_TYPES)
+@each("kind", SENSOR_TYPES)
 def test_names_of_topics_are_no_names_of_sensors(kind: str):
     inspector = inspectors()[kind]
     assert not re.fullmatch(inspector.plain_names, f"{inspector.prefix}0")

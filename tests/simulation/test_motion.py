@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.motion import Reference, ideal_readings
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.tools.simulation import handheld, simulate
-from icalib.tools.simulation.motion import Reference, ideal_readings
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 KINDS = ("handheld", "planar", "single_axis", "motionless")
@@ -20,7 +21,7 @@ def scenario_of(kind, duration_s=3.0, **changes):
     return replace(scenario, motion=motion, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3, **changes)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@each("kind", KINDS)
 def test_readings_are_derivatives_of_the_closed_form_pose(kind):
     sim = simulate(scenario_of(kind), seed=1)
     t, h = sim.truth.seconds[::50], 1e-4

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.data.recordings import open_recording, read_measurements
@@ -99,7 +100,7 @@ def test_noise_of_relative_poses_adds_up(scenario):
     assert np.sqrt(np.mean(np.square(ends)) / 3.0) == pytest.approx(0.02 * np.sqrt(length), rel=0.35)
 
 
-@pytest.mark.parametrize("form", ["tables", "run.bag", "run"])
+@each("form", ["tables", "run.bag", "run"])
 def test_what_is_written_reads_back(scenario, form, tmp_path):
     simulation = simulate(scenario, 3)
     path = tmp_path / form

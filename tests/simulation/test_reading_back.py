@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelPoses, WheelStream
@@ -68,8 +69,8 @@ def test_relative_poses(robot, tmp_path):
     assert len(open_recording(tmp_path / "run").stamps("wheel0/poses.csv")) == len(instance(truth, WheelPoses).pose)
 
 
-@pytest.mark.parametrize("name", ["run", "run.bag"])
-@pytest.mark.parametrize("measures", ["rates", "angles"])
+@each("name", ["run", "run.bag"])
+@each("measures", ["rates", "angles"])
 def test_bags(simulation, tmp_path, name, measures):
     bare = replace(simulation, scenario=replace(simulation.scenario, board=False, cameras=()))  # images take long
     write_sensors(bare, 3, tmp_path / name)

@@ -8,13 +8,14 @@ from functools import cached_property
 
 import numpy as np
 import pytest
+from icalib.geometry.targets.boards import Pattern, pattern_of
+from icalib.tools.simulation.projection import project
+from icalib.tools.simulation.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses, unproject
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
-from icalib.geometry.targets.boards import Pattern, pattern_of
 from icalib.tools.simulation import handheld, simulate
-from icalib.tools.simulation.projection import project
-from icalib.tools.simulation.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses, unproject
 from icalib.tools.simulation.scenario import SimCamera
 
 from .conftest import DISTORTED, lens
@@ -66,7 +67,7 @@ def middle_of(target: Target) -> tuple[float, float]:
     return tuple(0.5 * (low + high)[:2])
 
 
-@pytest.mark.parametrize("camera", LENSES, ids=lambda c: c.model)
+@each("camera", LENSES)
 def test_unprojection_is_the_inverse_of_projection(camera: SimCamera):
     u, v = np.meshgrid(np.linspace(-3.0, 162.0, 67), np.linspace(-3.0, 122.0, 51))
     uv = np.stack([u, v], axis=-1)
@@ -95,9 +96,9 @@ def edge_by_rows(camera: SimCamera, T_world_cam: np.ndarray) -> np.ndarray:
     return fine.reshape(height, 40).mean(axis=1)
 
 
-@pytest.mark.parametrize("blur", [0.0, 0.45, 0.9])
-@pytest.mark.parametrize("camera", LENSES, ids=lambda c: c.model)
-@pytest.mark.parametrize("shift", [0.0, 0.0031, 0.0057])
+@each("blur", [0.0, 0.45, 0.9])
+@each("camera", LENSES)
+@each("shift", [0.0, 0.0031, 0.0057])
 def test_edges_are_where_they_truly_are(camera: SimCamera, blur: float, shift: float):
     """The integral of the black along a row ends at the edge, whatever the blur; seen at an angle, through the lens."""
     pose = facing((shift, 0.0), 0.6, z=3.0, y=12.0, x=-9.0)
@@ -107,8 +108,8 @@ def test_edges_are_where_they_truly_are(camera: SimCamera, blur: float, shift: f
     np.testing.assert_allclose(black, edge_by_rows(camera, pose)[rows], atol=5e-4)
 
 
-@pytest.mark.parametrize("phase", [0.0, 0.2, 0.5, 0.77])
-@pytest.mark.parametrize("sigma", [0.3, 0.6, 1.2])
+@each("phase", [0.0, 0.2, 0.5, 0.77])
+@each("sigma", [0.3, 0.6, 1.2])
 def test_an_edge_is_blurred_as_a_gaussian_blurs_it(phase: float, sigma: float):
     """Square on, its profile is the difference of two integrals of the normal distribution."""
     cx = PINHOLE.intrinsics[2]
@@ -151,7 +152,7 @@ def test_a_symmetric_board_turned_by_half_a_turn_is_the_same_image():
     assert np.abs(odd - odd[::-1, ::-1]).max() > 100.0
 
 
-@pytest.mark.parametrize("camera", LENSES, ids=lambda c: c.model)
+@each("camera", LENSES)
 def test_flat_fields(camera: SimCamera):
     imaging = Imaging(blur_px=0.7)
     np.testing.assert_allclose(Renderer(camera, imaging).picture([], facing()).grey, 110.0, rtol=1e-6)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import RigError
@@ -136,7 +137,7 @@ def test_every_field_arrives(tmp_path):
     np.testing.assert_allclose(s.T_world_board, T, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", sorted(PAPER.glob("*.yaml")), ids=lambda path: path.stem)
+@each("path", sorted(PAPER.glob("*.yaml")))
 def test_shipped_scenarios_load_and_run(path):
     scenario = load_scenario(path)
     lidars = tuple(replace(s, azimuth_steps=36) for s in scenario.of(SimLidar))
@@ -218,9 +219,7 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize(
-    ("good", "bad", "words"), [(good, bad, words) for good, cases in BAD.items() for bad, words in cases]
-)
+@each(("good", "bad", "words"), [(good, bad, words) for good, cases in BAD.items() for bad, words in cases])
 def test_a_bad_file_ends_in_a_sentence(tmp_path, good, bad, words):
     assert good in FULL
     with pytest.raises(RigError, match=words) as caught:
@@ -245,7 +244,7 @@ def test_stamps_of_today_have_19_digits(tmp_path):
     assert s.imu_clock_origin_ns == 1_700_000_000_000_000_000
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("duration: 3", "duration: 1000000", "imu0 would measure 200,000,000 readings, and 5,000,000 are the most"),
@@ -314,7 +313,7 @@ def test_effects_are_read(tmp_path):
     assert [p.scale for p in scenario.of(SimPoses)] == [0.99] and scenario.target_size == 1.01
 
 
-@pytest.mark.parametrize(
+@each(
     ("old", "new", "words"),
     [
         ("0.03]", "3]", "effects.imu.accel_scale: must be between -0.2 and 0.2: 0.01 is 1 %"),

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.projection import project
+from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Markers, Scene
 from icalib.tools.simulation import Imaging, film, handheld, simulate, tag_map
-from icalib.tools.simulation.projection import project
 
 
 def tags_seen(sim, camera: int) -> np.ndarray:
@@ -20,8 +21,8 @@ def tags_seen(sim, camera: int) -> np.ndarray:
     return np.bincount(pairs[0][pairs[1] < 12], minlength=len(stream.stamps_ns))
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("with_grid", [False, True])
+@each("seed", range(3))
+@each("with_grid", [False, True])
 def test_every_image_shows_three_tags_and_every_tag_is_seen_often(seed: int, with_grid: bool):
     sim = simulate(tag_map(20.0, with_grid=with_grid), seed)
     for k, stream in enumerate(sim.measurements.cameras):

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance, not_none
 
 from icalib.data.measurements import WheelPoses
@@ -47,7 +48,7 @@ def quiet(robot):
     return simulate(replace(alone(robot), duration_s=8.0, features=robot.features, robot_noise_enabled=False), 2)
 
 
-@pytest.mark.parametrize("camera", [0, 1, 2])
+@each("camera", [0, 1, 2])
 def test_tracks_are_projections_of_points_that_are_not_hidden(quiet, camera):
     stream, lens, room = quiet.measurements.tracks[camera], quiet.scenario.cameras[camera], quiet.scenario.room
     for image in range(0, len(stream.stamps_ns), 20):

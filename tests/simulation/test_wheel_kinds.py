@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from icalib.tools.simulation.trajectory import DriveKind
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelStream
@@ -14,7 +16,6 @@ from icalib.errors import RigError
 from icalib.rig.file import load_rig
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import simulate
-from icalib.tools.simulation.trajectory import DriveKind
 from icalib.tools.simulation.writing import write_sensors, write_tables
 
 from .conftest import alone, on_ground, wheel_path
@@ -52,8 +53,8 @@ def moved(sim, begin, end, parts=400):
     return np.array([path, 0.5 * (small[:, 1, 0] - small[:, 0, 1]).sum()])
 
 
-@pytest.mark.parametrize("kind", ["planar", "ramps"])
-@pytest.mark.parametrize("sampling", ["interval-mean", "instantaneous"])
+@each("kind", ["planar", "ramps"])
+@each("sampling", ["interval-mean", "instantaneous"])
 def test_speed_and_yaw_rate_are_those_of_the_path_over_their_scales(robot, kind, sampling):
     sim = simulate(replace(reporting(robot, "twist", sampling, kind), robot_noise_enabled=False), 3)
     stream, t = sim.measurements.wheels[0], instants(sim)
@@ -113,8 +114,8 @@ def test_front_wheels_that_would_have_to_stand_across_are_refused(robot):
 RIG = "sensors:\n  imu0: {type: imu}\n  mocap0: {type: pose}\n  wheel0: {type: wheels, WHAT}\n"
 
 
-@pytest.mark.parametrize("write", [write_tables, write_sensors], ids=["tables", "bag"])
-@pytest.mark.parametrize(("reports", "what"), [("twist", "measures: twist"), ("steering", "drive: ackermann")])
+@each("write", [write_tables, write_sensors])
+@each(("reports", "what"), [("twist", "measures: twist"), ("steering", "drive: ackermann")])
 def test_what_is_written_is_read_again(tmp_path, robot, write, reports, what):
     sim = simulate(reporting(robot, reports), 3)
     write(sim, 3, tmp_path / "run")

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
 from tests.typed import instance
 
 from icalib.data.measurements import WheelPoses, WheelStream
@@ -33,7 +34,7 @@ def turned(sim, begin, end, parts=2000):
     return np.array([ahead - 0.5 * w.baseline * yaw, ahead + 0.5 * w.baseline * yaw]) / w.radii
 
 
-@pytest.mark.parametrize("kind", ["planar", "ramps", "spin"])
+@each("kind", ["planar", "ramps", "spin"])
 def test_mean_rates_are_the_angles_turned_since_the_stamp_before(robot, kind):
     scenario = replace(alone(on_ground(robot, kind)), robot_noise_enabled=False)
     sim = simulate(scenario, 6)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from icalib.detection.tracker import epipolar_errors
+from tests.cases import each
+
 from icalib.sensors.camera.read.image_tracks import moving_features
 
 SIZE = (752, 480)
@@ -53,8 +54,8 @@ def _seen(lens, walking: int, rng: np.random.Generator) -> tuple[np.ndarray, np.
     return np.cumsum([0, *count]), np.concatenate(feature), np.concatenate(uv)
 
 
-@pytest.mark.parametrize("lens", [_radtan, _fisheye])
-@pytest.mark.parametrize("walking", [0, 10, 20])
+@each("lens", [_radtan, _fisheye])
+@each("walking", [0, 10, 20])
 def test_a_body_that_walks_is_told_from_the_room(lens, walking):
     start, feature, uv = _seen(lens, walking, np.random.default_rng(walking))
     found = np.append(moving_features(start, feature, uv, SIZE), np.zeros(100, dtype=bool))[:100]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
 from icalib.detection.tracker import RADIUS, align, cut_templates
+from tests.cases import each
 
 SIZE = 96
 
@@ -23,7 +23,7 @@ def _image(A: np.ndarray, shift: np.ndarray, centre: np.ndarray) -> np.ndarray:
     return _grey(*(centre[:, None] + d)).reshape(SIZE, SIZE).astype(np.float32)
 
 
-@pytest.mark.parametrize(
+@each(
     ("A", "shift"),
     [
         (np.eye(2), (0.4, -0.3)),
@@ -31,7 +31,7 @@ def _image(A: np.ndarray, shift: np.ndarray, centre: np.ndarray) -> np.ndarray:
         (np.array([[np.cos(0.2), -np.sin(0.2)], [np.sin(0.2), np.cos(0.2)]]), (-0.5, 0.2)),
     ],
 )
-@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.6, 40.0)])
+@each(("gain", "offset"), [(1.0, 0.0), (0.6, 40.0)])
 def test_a_known_map_is_found_whatever_the_exposure(A, shift, gain, offset):
     centre = np.array([48.0, 48.0])
     first, good = cut_templates(_image(np.eye(2), np.zeros(2), centre), centre[None])

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from icalib.estimate.solver import minimise
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from icalib.estimate.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.arrowhead import Prior
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
@@ -129,6 +129,7 @@ def test_hills_without_noise_give_everything_back(drive_of_kind, world_of, probl
     assert e[6] < 5e-6 and e[7:9].max() < 1e-6 and e[9] < 2e-5
 
 
+@pytest.mark.full
 @pytest.mark.parametrize("kind", ["planar", "hills"])
 def test_errors_are_as_large_as_the_covariance_says(drive_of_kind, world_of, problem_of, kind):
     seeds, planar = 24, kind == "planar"
@@ -165,7 +166,9 @@ def slipping_waves(waves, rng, density):
     )
 
 
-@pytest.mark.parametrize(("density", "chi2_of_rows"), [(5e-3, (0.6, 1.0)), (1e-2, (2.3, 4.0))])
+@pytest.mark.parametrize(
+    ("density", "chi2_of_rows"), [pytest.param(5e-3, (0.6, 1.0), marks=pytest.mark.full), (1e-2, (2.3, 4.0))]
+)
 def test_a_vehicle_that_drifts_sideways_is_within_its_slip_density_or_shows_in_its_rows(
     drive_of_kind, world_of, problem_of, waves, density, chi2_of_rows
 ):

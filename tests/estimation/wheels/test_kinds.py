@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from tests.cases import each
 
 from icalib.data.measurements import WheelStream
 from icalib.optim.arrowhead import make_pieces
@@ -67,8 +67,8 @@ def rows(factor, state):
 
 # On hills the logarithm of a rotation is not the integral of its rate; and everywhere the mean of a product is not the
 # product of means, which leaves d(angle) d(speed) dt / 12 of the steering row.
-@pytest.mark.parametrize(("path", "rest", "slip"), [("planar", 1e-6, 1e-8), ("hills", 4e-5, 4e-6)])
-@pytest.mark.parametrize("kind", DRIVES)
+@each(("path", "rest", "slip"), [("planar", 1e-6, 1e-8), ("hills", 4e-5, 4e-6)])
+@each("kind", DRIVES)
 def test_residuals_vanish_on_a_path_without_slip(drive_of_kind, world_of, waves, kind, path, rest, slip):
     world, stream = world_with(world_of, forwards(drive_of_kind, waves, path), kind)
     r = np.abs(rows(factor_on(world, stream), world.state))
@@ -76,7 +76,7 @@ def test_residuals_vanish_on_a_path_without_slip(drive_of_kind, world_of, waves,
     assert r[:, 0].max() < rest and r[:, 1].max() < (2e-5 if kind == "steered" else rest) and r[:, 2:].max() < slip
 
 
-@pytest.mark.parametrize(
+@each(
     ("kind", "name", "step", "row"),
     [
         ("twist", "scales", [0.01, 0.0], 0),
@@ -120,9 +120,7 @@ def test_the_steering_row_is_whitened_by_the_way_of_the_front_axle(drive_of_kind
     np.testing.assert_allclose(1.0 / factor.whitening[:, 0, 0], 0.02 * np.sqrt(dt), rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("kind", "drive"), [("pair", [0.1, 0.12, 0.5]), ("twist", [1.1, 0.9, 0.0]), ("steered", [0.1, 0.6, 0.3])]
-)
+@each(("kind", "drive"), [("pair", [0.1, 0.12, 0.5]), ("twist", [1.1, 0.9, 0.0]), ("steered", [0.1, 0.6, 0.3])])
 def test_derivatives_of_the_coefficients(kind, drive):
     """The last parameter is the unit of length."""
     rng, drive = np.random.default_rng(0), np.array([*drive, 1.3])
