@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import yaml
-from icalib.sensors.camera.assess.lenses import _named_model, _Trial
 from tests.cases import each
 from tests.typed import instance
 
@@ -20,6 +19,7 @@ from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
 from icalib.rig.file import target_of
 from icalib.rig.rig import SENSOR_TYPES
+from icalib.sensors.camera.assess.lenses import _named_model, _Trial
 from icalib.sensors.camera.spec import Camera
 
 SOURCE = Path(icalib.__file__).parent

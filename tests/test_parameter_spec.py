@@ -11,11 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import specs_of, tolerance_of
 from tests.cases import each
 
 import icalib
 from icalib.base.yaml_nodes import parse_yaml
+from icalib.estimate.inputs import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
 from icalib.model.sensor_model import own_entries
 from icalib.optim.state import make_layout

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from icalib.geometry.targets.boards import pattern_of
 from tests.cases import each
 
 from icalib.base.files import sealed
 from icalib.cli import main
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Tag, Target
+from icalib.geometry.targets.boards import pattern_of
 from icalib.tools.printing import PAPERS, target_pdf, write_target
 
 pytest.importorskip("reportlab")

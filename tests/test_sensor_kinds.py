@@ -8,7 +8,7 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-from tests.cases import each
+import pytest
 
 import icalib
 from icalib.sensors import SENSOR_KINDS
@@ -30,26 +30,18 @@ NAMING = {
     "result/calibration.py",  # shorthand, for users
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
-    "result/calibration.py",  # names of pictures in place of seconds
+    "result/saving.py",  # records of residuals that it saves
     "tools/allan/analysis.py",  # the noise of IMUs
     "tools/simulation/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario.py",
     "tools/simulation/scenario_file.py",
-    "tools/simulation/scenario.py",
-    "tools/simulation/writing.py",
-    "tools/simulation/corners.py",
-    "tools/simulation/motion.py",
-    "tools/simulation/recording.py",
-    "tools/simulation/corners.py",
-    "tools/simulation/writing.py",
     "tools/simulation/writing.py",
     "tools/view.py",  # shows what cameras, IMUs and LiDARs recorded
     "tools/simulation/corners.py",
     "tools/simulation/motion.py",
     "tools/simulation/recording.py",
     "validation/causes.py",  # checks that were made for the sensors of the rig
-    "validation/causes.py",  # noise of the IMU
 }
 
 
@@ -93,7 +85,7 @@ def test_no_module_outside_of_the_folders_of_sensors_names_a_kind():
     assert set(found) >= NAMING, "take modules that name no kind any more off the list"
 
 
-@each(
+@pytest.mark.parametrize(
     ("source", "named"),
     [
         ("from icalib.rig import Lidar, Rig", {"Lidar"}),

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from icalib.tools.simulation.motion import read_imu
 from tests.cases import each
 
 from icalib.cli import main

@@ -5,13 +5,13 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from icalib.detection.checkerboard import shows_grid
-from icalib.detection.decoding import ImageCorners
-from icalib.detection.detectors import checkerboard_in, detector_of
 from tests.cases import each
 
 from icalib.detection import CheckerboardDetector, detectors
 from icalib.detection import checkerboard as module
+from icalib.detection.checkerboard import shows_grid
+from icalib.detection.decoding import ImageCorners
+from icalib.detection.detectors import checkerboard_in, detector_of
 from icalib.detection.images import number_continuously
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Scene
 

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.detection.decoding import corner_stream
-from icalib.detection.detectors import detector_of
-from icalib.sensors.camera.corner_bias import ellipse_shift
 from tests.cases import each
 
 from icalib.data.measurements import CornerStream, Measurements
+from icalib.detection.decoding import corner_stream
+from icalib.detection.detectors import detector_of
 from icalib.errors import RigError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Checkerboard, Circles, Scene
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig.file import load_rig, load_target
+from icalib.sensors.camera.corner_bias import ellipse_shift
 from icalib.tools.inspection import read_target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera

@@ -6,10 +6,6 @@ import importlib
 
 import numpy as np
 import pytest
-from icalib.detection.decoding import with_verdicts
-from icalib.detection.detectors import detector_of
-from icalib.detection.tags import tag_family
-from icalib.geometry.targets.boards import pattern_of
 from tests.cases import each
 
 from icalib.base.extras import load_cv2
@@ -22,6 +18,9 @@ from icalib.detection import (
     MarkerDetector,
     corner_stream,
 )
+from icalib.detection.decoding import with_verdicts
+from icalib.detection.detectors import detector_of
+from icalib.detection.tags import tag_family
 from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Charuco
 from icalib.geometry.targets.boards import pattern_of

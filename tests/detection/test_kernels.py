@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from icalib.detection.decoding import bilinear, lookup, mapped, popcount, read_cells, unit_homography, visible_cells
-from icalib.detection.edge_model import fit_corners, fit_step, solve_small
-from icalib.detection.growth import consistent_corners, fit_homography, largest_group
-from icalib.detection.saddles import fit_crossing
 from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 from scipy.special import erf
 from tests.cases import each
+
+from icalib.detection.decoding import bilinear, lookup, mapped, popcount, read_cells, unit_homography, visible_cells
+from icalib.detection.edge_model import fit_corners, fit_step, solve_small
+from icalib.detection.growth import consistent_corners, fit_homography, largest_group
+from icalib.detection.saddles import fit_crossing
 
 H_TRUE = np.array([[30.0, 4.0, 100.0], [-3.0, 28.0, 80.0], [0.02, -0.03, 1.0]])
 

@@ -7,13 +7,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from icalib.detection.detectors import detector_of, other_columns, other_size, with_other_layout
-from icalib.geometry.targets.boards import pattern_of
 from tests.cases import each
 
 from icalib.detection import what_is_seen
+from icalib.detection.detectors import detector_of, other_columns, other_size, with_other_layout
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
+from icalib.geometry.targets.boards import pattern_of
 from icalib.rig.file import load_target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera

@@ -7,13 +7,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from tests.cases import each
+from tests.typed import instance
+
 from icalib.detection.decoding import ImageCorners, mapped, no_corners
 from icalib.detection.detectors import _Detector, _Follower, detector_of
 from icalib.detection.growth import PredictedCorners, predict_corners, predict_nodes
 from icalib.detection.tags import ImageWithQuads
-from tests.cases import each
-from tests.typed import instance
-
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles
 from icalib.tools.simulation import HandheldMotion, film, handheld
 

@@ -8,13 +8,13 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from icalib.detection.decoding import ImageCorners, no_corners
-from icalib.detection.detectors import detector_of
 from tests.cases import each
 from tests.typed import StandIn
 
 from icalib.data.recordings import Payload, TopicInfo
 from icalib.detection import tags as quads
+from icalib.detection.decoding import ImageCorners, no_corners
+from icalib.detection.detectors import detector_of
 from icalib.detection.images import sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from icalib.detection.checkerboard import shows_grid
-from icalib.detection.detectors import detector_of, other_size
 from tests.cases import each
 
+from icalib.detection.checkerboard import shows_grid
+from icalib.detection.detectors import detector_of, other_size
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Target
 
 SIDES = (1, 2, 7, 10, 11, 12, 14, 15, 16, 23, 24)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from icalib.detection.detectors import detector_of
 from tests.cases import each
 
+from icalib.detection.detectors import detector_of
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Target
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera

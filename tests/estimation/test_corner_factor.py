@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.projection import project
 from scipy.optimize import minimize
 from tests.cases import each
 
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.sensors.camera.corner_factor import CornerNoise
+from icalib.tools.simulation.projection import project
 
 
 @pytest.fixture(scope="module")

@@ -6,11 +6,11 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import Inputs
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.estimate.estimate import Estimate
+from icalib.estimate.inputs import Inputs
 from icalib.geometry.cameras import camera_model
 from icalib.model.sensor_model import Fit
 from icalib.rig import Camera, Settings

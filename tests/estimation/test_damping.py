@@ -6,8 +6,9 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
-from icalib.estimate.solver import CAREFUL_DAMPING, Damping, Descent, Step
 from tests.cases import each
+
+from icalib.estimate.solver import CAREFUL_DAMPING, Damping, Descent, Step
 
 
 @each(

@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.cases import each
+
 from icalib.sensors.camera.corner_bias import with_bent_edges
 from icalib.tools.simulation.projection import project
-from tests.cases import each
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.track_surfaces import ON_PLANES
 from scipy import sparse
 from scipy.sparse.linalg import LinearOperator
 from tests.cases import each
@@ -36,6 +35,7 @@ from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
+from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of

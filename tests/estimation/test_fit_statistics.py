@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.jacobian_noise import spurious_information
-from icalib.estimate.solver import Draws, Outcome, SolverOptions, minimise, posterior
 from tests.cases import each
 from tests.estimation.test_arrowhead import random_pieces
 from tests.estimation.test_front import build
 from tests.typed import not_none
 
+from icalib.estimate.jacobian_noise import spurious_information
 from icalib.estimate.residual_statistics import fits
+from icalib.estimate.solver import Draws, Outcome, SolverOptions, minimise, posterior
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import Piece, solve
 from icalib.sensors.camera.corner_factor import CornerFactor

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from icalib.estimate.solver import Outcome, SolverOptions, minimise
-from icalib.sensors.camera.track_factor import FeatureFactor
-from icalib.sensors.camera.track_selection import _tag_corners
-from icalib.sensors.camera.track_selection import image_cells as cells_of
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
 from icalib.estimate.problem import Problem, assemble
 from icalib.estimate.residual_statistics import _cluster_gradients, _count, cluster_covariances
+from icalib.estimate.solver import Outcome, SolverOptions, minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.model.bodies import Bodies

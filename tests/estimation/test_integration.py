@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.motion import reference_motion
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 from tests.cases import each
@@ -23,6 +22,7 @@ from icalib.motion.integration import (
 from icalib.motion.integration_step import COVARIANCE_SIZE, RUN_SIZE, correction
 from icalib.rig import ImuNoise
 from icalib.tools.simulation import handheld
+from icalib.tools.simulation.motion import reference_motion
 
 BIAS = np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.15])
 INTRINSICS = np.random.default_rng(5).normal(size=24) * np.repeat([0.01, 0.01, 0.02, 2e-3], [6, 6, 3, 9])

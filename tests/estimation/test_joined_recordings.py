@@ -6,13 +6,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import inputs_for
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.data.measurements import PAUSE_NS, Measurements, join
 from icalib.data.recordings import naming, open_all
 from icalib.errors import RecordingError
+from icalib.estimate.inputs import inputs_for
 from icalib.estimate.problem import assemble
 from icalib.estimate.residual_statistics import segment_ends
 from icalib.geometry import so3

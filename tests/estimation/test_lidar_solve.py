@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.solver import minimise
 from scipy.stats import chi2
 from tests.typed import not_none
 
 from icalib.detection.planes import PlaneSearch, find_planes
+from icalib.estimate.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.state import make_layout
 from icalib.sensors.lidar.binning import BIN_S, LidarNoise, in_world

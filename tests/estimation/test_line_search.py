@@ -6,11 +6,11 @@ from __future__ import annotations
 from types import SimpleNamespace
 
 import numpy as np
-from icalib.estimate.solver import SolverOptions, minimise
 from scipy.optimize import minimize
 from tests.cases import each
 from tests.typed import StandIn
 
+from icalib.estimate.solver import SolverOptions, minimise
 from icalib.optim.anderson import Accelerator
 from icalib.optim.arrowhead import NO_DIRECTIONS, make_pieces, solve
 from icalib.optim.state import State, make_layout

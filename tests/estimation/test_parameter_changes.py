@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from tests.cases import each
 
-from icalib.estimate.residual_statistics import Candidate, Change, Scatter, _Form
+from icalib.estimate.parameter_changes import Candidate, Change, Scatter, _Form
 
 G, B = 8, 6
 COLUMNS, PATTERN = np.arange(3), np.arange(G) - 3.5

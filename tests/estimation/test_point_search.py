@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.track_factor import FeatureFactor
-from icalib.sensors.camera.track_surfaces import MAX_DISTANCE_M
-from icalib.sensors.camera.tracks import FeatureOutput
 from tests.cases import each
 
 from icalib.optim.arrowhead import make_pieces
+from icalib.sensors.camera.track_factor import FeatureFactor
+from icalib.sensors.camera.track_surfaces import MAX_DISTANCE_M
+from icalib.sensors.camera.tracks import FeatureOutput
 from icalib.tools.simulation import handheld, simulate
 
 

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.solver import CONVERGED_DECREASE, SolverOptions, minimise
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
 from icalib.estimate import solver
+from icalib.estimate.solver import CONVERGED_DECREASE, SolverOptions, minimise
 from icalib.geometry import so3
 from icalib.motion.factor import of_type
 from icalib.optim.arrowhead import N_THREADS, solve

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.solver import Outcome, minimise
 from tests.typed import not_none
 
 from icalib.estimate.problem import Problem
 from icalib.estimate.residual_statistics import Segments, noise_variance, split_covariance, split_expectation
+from icalib.estimate.solver import Outcome, minimise
 from icalib.motion.factor import keyed
 from icalib.optim.arrowhead import KEYFRAME_DIM, Piece, Prior
 from icalib.sensors.imu.residual import ImuFactor

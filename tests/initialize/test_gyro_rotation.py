@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from icalib.initialize.rate_correlation import GyroRotation
 from tests.cases import each
 
 from icalib.geometry import so3
+from icalib.initialize.rate_correlation import GyroRotation
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import assign_keyframes
 

@@ -6,8 +6,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.initialize.intrinsics import guess_intrinsics
-from icalib.sensors.camera.initialize.target_poses import FlatPoints, target_poses
 from tests.cases import each
 from tests.typed import instance, not_none
 
@@ -16,6 +14,8 @@ from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Parameter, Rig
+from icalib.sensors.camera.initialize.intrinsics import guess_intrinsics
+from icalib.sensors.camera.initialize.target_poses import FlatPoints, target_poses
 from icalib.sensors.camera.initialize.target_with_imu import initial_guess, initial_trajectory
 from icalib.tools.simulation import HandheldMotion, Simulation, handheld, rig_for, simulate
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from icalib.initialize.initializer import KnownExtrinsics
 from tests.cases import each
 from tests.typed import not_none, random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.sensors.lidar.initialize.association import lidar_and_motion, lidar_on_motion
+from icalib.initialize.initializer import KnownExtrinsics
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 
 pytestmark = pytest.mark.slow
 

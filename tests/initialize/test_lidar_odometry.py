@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.initialize.rate_correlation import GyroRotation
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 from tests.typed import random_rotations
 
 from icalib.errors import EstimationError
 from icalib.geometry import so3
+from icalib.initialize.rate_correlation import GyroRotation
 from icalib.initialize.trajectories import ImuTrajectory, SignalIntegrals, system_from_readings, system_from_trajectory
 from icalib.sensors.lidar.initialize import odometry
 from icalib.sensors.lidar.initialize.odometry import (

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import specs_of, tolerance_of
-from icalib.estimate.solver import minimise
 from tests.cases import each
 
 from icalib.errors import EstimationError
+from icalib.estimate.inputs import specs_of, tolerance_of
 from icalib.estimate.problem import Problem
+from icalib.estimate.solver import minimise
 from icalib.initialize.trajectories import ExtrinsicsGuess
 from icalib.motion.factor import keyed
 from icalib.motion.poses import EstimatedMotion, place_keyframes
@@ -21,14 +21,8 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import (
-    ASSOCIATION_ROUNDS,
-    associate,
-    check_shares,
-    lidar_and_motion,
-    lidar_on_motion,
-    round_search,
-)
+from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, check_shares, round_search
+from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.residual import LidarFactor
 
 pytestmark = pytest.mark.slow

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import inputs_for
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 
 from icalib.data.measurements import PoseStream
 from icalib.errors import EstimationError
+from icalib.estimate.inputs import inputs_for
 from icalib.optim.state import State
 from icalib.sensors.pose.initialize import pose_values, state_from_poses
 from icalib.sensors.pose.simulate import SimPoses

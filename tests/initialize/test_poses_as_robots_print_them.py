@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.initialize.hand_eye import PosePairs, hand_eye, unexplained_motion
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
+from icalib.initialize.hand_eye import PosePairs, hand_eye, unexplained_motion
 from icalib.rig import PoseSensor
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.sensors.pose.initialize.conventions import Convention, best_convention, with_checked_convention

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from icalib.initialize.rate_alignment import RateAlignment, align_rates, check_two_axes
-from icalib.initialize.rate_correlation import SensorRates
-from icalib.tools.simulation.motion import rotation_from_vector
 from tests.cases import each
 
 from icalib.data.measurements import ImuStream
 from icalib.errors import EstimationError
+from icalib.initialize.rate_alignment import RateAlignment, align_rates, check_two_axes
+from icalib.initialize.rate_correlation import SensorRates
 from icalib.motion.imu_data import ImuData
 from icalib.rig import ImuNoise
+from icalib.tools.simulation.motion import rotation_from_vector
 
 R_IMU_CAM = rotation_from_vector(np.array([0.4, -1.1, 0.7]))
 OFFSET = 0.04

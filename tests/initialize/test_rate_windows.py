@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+from tests.cases import each
+
 from icalib.initialize.smooth_trajectory import (
     MIN_HALF_WINDOW_S,
     rate_window,
@@ -11,8 +14,6 @@ from icalib.initialize.smooth_trajectory import (
     smooth_trajectory,
     window_rates,
 )
-from scipy.spatial.transform import Rotation
-from tests.cases import each
 
 
 def turning(hz: float, noise: float, seconds: float = 20.0, seed: int = 0):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.initialize.scene_intrinsics import find_scene, is_plausible_lens, scene_intrinsics
 from tests.cases import each
 from tests.typed import instance, not_none
 
@@ -17,6 +16,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets import Markers
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
+from icalib.sensors.camera.initialize.scene_intrinsics import find_scene, is_plausible_lens, scene_intrinsics
 from icalib.sensors.camera.model import choose_bodies
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import load_scenario, rig_for, simulate, tag_map

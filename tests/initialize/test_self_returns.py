@@ -10,7 +10,7 @@ from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.sensors.lidar import initialize
-from icalib.sensors.lidar.initialize import _NearPoints, self_returns_of, without_self_returns
+from icalib.sensors.lidar.initialize.self_returns import _NearPoints, self_returns_of, without_self_returns
 
 pytestmark = pytest.mark.slow
 

@@ -1,9 +1,10 @@
 """Parabolas through poses, against motions whose derivatives are known."""
 
 import numpy as np
-from icalib.initialize.smooth_trajectory import smooth_trajectory
 from scipy.spatial.transform import Rotation
 from tests.cases import each
+
+from icalib.initialize.smooth_trajectory import smooth_trajectory
 
 TURN = np.array([0.3, -1.2, 2.0])  # rad/s
 

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import inputs_for
-from icalib.initialize.initializer import joined_states
-from icalib.sensors.camera.initialize.epipolar import MIN_POINT_RANGE_M, _ray_errors, ray_derivatives
 from scipy.spatial.transform import Rotation
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
+from icalib.estimate.inputs import inputs_for
 from icalib.geometry.cameras import camera_model
+from icalib.initialize.initializer import joined_states
 from icalib.motion.imu_data import ImuData
 from icalib.optim.state import State
 from icalib.rig import Parameter
 from icalib.sensors.camera.initialize import track_camera_values
+from icalib.sensors.camera.initialize.epipolar import MIN_POINT_RANGE_M, _ray_errors, ray_derivatives
 from icalib.tools.simulation import Drive, load_scenario, rig_for, simulate, with_drawn_guess
 
 pytestmark = pytest.mark.slow

@@ -7,9 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.sensors.camera.initialize.epipolar import direction_for_rotation, rotation_information
-from icalib.sensors.camera.initialize.joint_alignment import track_rates
-from icalib.sensors.camera.initialize.track_intrinsics import find_intrinsics
 from tests.cases import each
 
 from icalib.errors import EstimationError
@@ -19,6 +16,9 @@ from icalib.geometry.targets import NoTarget
 from icalib.motion.imu_data import ImuData
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Camera, Parameter
+from icalib.sensors.camera.initialize.epipolar import direction_for_rotation, rotation_information
+from icalib.sensors.camera.initialize.joint_alignment import track_rates
+from icalib.sensors.camera.initialize.track_intrinsics import find_intrinsics
 from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Drive, Simulation, load_scenario, rig_for, simulate
 

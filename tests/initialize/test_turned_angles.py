@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.estimate.inputs import inputs_for
-from icalib.initialize.rate_correlation import ChainedRates, max_rate_step, offsets_by_angle
 
 from icalib.data.measurements import CornerStream, PoseStream
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import EstimationError
+from icalib.estimate.inputs import inputs_for
 from icalib.geometry import so3
+from icalib.initialize.rate_correlation import ChainedRates, max_rate_step, offsets_by_angle
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter, Wheels
 from icalib.sensors.pose.simulate import SimPoses

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from icalib.data.recording import Reading
 from tests.cases import each
 from tests.typed import instance
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.projection import image_velocity, project, visible
 from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.tools.simulation import SimCamera, handheld, simulate
+from icalib.tools.simulation.projection import image_velocity, project, visible
 
 FISHEYE = SimCamera(
     "cam0", "pinhole-equidistant", (752, 480), (190.0, 191.0, 375.0, 240.0), (0.03, -0.01, 0.004, -0.001), np.eye(4)

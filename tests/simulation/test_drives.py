@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.trajectory import Jet
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.errors import RecordingError, RigError
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import Drive, Room, hills_of_slope, simulate
+from icalib.tools.simulation.trajectory import Jet
 
 from .conftest import alone, on_ground, turn, wheel_path
 

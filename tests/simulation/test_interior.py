@@ -6,10 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.filming import Interior, RoomRenderer
-from icalib.tools.simulation.projection import project
-from icalib.tools.simulation.rendering import pixel_kernel, shrink, unproject
-from icalib.tools.simulation.room import atlas_of, dead_leaves, distances
 from tests.cases import each
 
 from icalib.errors import RigError
@@ -25,6 +21,10 @@ from icalib.tools.simulation import (
     film,
     hills_of_slope,
 )
+from icalib.tools.simulation.filming import Interior, RoomRenderer
+from icalib.tools.simulation.projection import project
+from icalib.tools.simulation.rendering import pixel_kernel, shrink, unproject
+from icalib.tools.simulation.room import atlas_of, dead_leaves, distances
 from icalib.tools.simulation.scenario import faults_of
 
 from .conftest import DISTORTED

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.motion import Reference, ideal_readings
 from tests.cases import each
 from tests.typed import not_none
 
 from icalib.tools.simulation import handheld, simulate
+from icalib.tools.simulation.motion import Reference, ideal_readings
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
 KINDS = ("handheld", "planar", "single_axis", "motionless")

@@ -8,14 +8,14 @@ from functools import cached_property
 
 import numpy as np
 import pytest
-from icalib.geometry.targets.boards import Pattern, pattern_of
-from icalib.tools.simulation.projection import project
-from icalib.tools.simulation.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses, unproject
 from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Tag, Target
+from icalib.geometry.targets.boards import Pattern, pattern_of
 from icalib.tools.simulation import handheld, simulate
+from icalib.tools.simulation.projection import project
+from icalib.tools.simulation.rendering import Imaging, Picture, Renderer, Sheet, exposure_poses, unproject
 from icalib.tools.simulation.scenario import SimCamera
 
 from .conftest import DISTORTED, lens

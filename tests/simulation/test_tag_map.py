@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.projection import project
 from tests.cases import each
 
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Markers, Scene
 from icalib.tools.simulation import Imaging, film, handheld, simulate, tag_map
+from icalib.tools.simulation.projection import project
 
 
 def tags_seen(sim, camera: int) -> np.ndarray:

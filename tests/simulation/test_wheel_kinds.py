@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from icalib.tools.simulation.trajectory import DriveKind
 from tests.cases import each
 from tests.typed import instance
 
@@ -16,6 +15,7 @@ from icalib.errors import RigError
 from icalib.rig.file import load_rig
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.simulation import simulate
+from icalib.tools.simulation.trajectory import DriveKind
 from icalib.tools.simulation.writing import write_sensors, write_tables
 
 from .conftest import alone, on_ground, wheel_path

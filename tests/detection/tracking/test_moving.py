@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from icalib.detection.tracker import epipolar_errors
 from tests.cases import each
 
+from icalib.detection.tracker import epipolar_errors
 from icalib.sensors.camera.read.image_tracks import moving_features
 
 SIZE = (752, 480)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from icalib.detection.tracker import RADIUS, align, cut_templates
 from tests.cases import each
+
+from icalib.detection.tracker import RADIUS, align, cut_templates
 
 SIZE = 96
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from icalib.estimate.solver import minimise
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from icalib.estimate.solver import minimise
 from icalib.geometry import so3
 from icalib.optim.arrowhead import Prior
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
