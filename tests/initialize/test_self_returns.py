@@ -9,7 +9,7 @@ import pytest
 from tests.cases import each
 
 from icalib.data.measurements import LidarStream, Measurements
-from icalib.sensors.lidar import initialize
+from icalib.sensors.lidar.initialize import self_returns
 from icalib.sensors.lidar.initialize.self_returns import _NearPoints, self_returns_of, without_self_returns
 
 pytestmark = pytest.mark.slow
@@ -66,15 +66,15 @@ def test_what_stays_in_place_but_is_not_the_robot_s(robot, example, changes):
 
 def test_that_the_floor_is_seen_from_afar_is_what_saves_it(robot, monkeypatch):
     stream = raw(robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0])
-    monkeypatch.setattr(initialize, "MIN_SHARE_FROM_FAR", 2.0)
+    monkeypatch.setattr(self_returns, "MIN_SHARE_FROM_FAR", 2.0)
     assert self_returns_of(stream) is not None
 
 
 def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
     """And the robot is found in all of it."""
-    monkeypatch.setattr(initialize, "MAX_SEARCHED_SCANS", 70)
+    monkeypatch.setattr(self_returns, "MAX_SEARCHED_SCANS", 70)
     whole = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar").streams[0]
-    assert len(whole.stamps_ns) > 1.5 * initialize.MAX_SEARCHED_SCANS
+    assert len(whole.stamps_ns) > 1.5 * self_returns.MAX_SEARCHED_SCANS
     stream, hit = with_panel(whole, *PANELS["panel ahead"])
     own = self_returns_of(stream)
     assert own is not None and own[hit].mean() > 0.99 and own[~hit].mean() < 0.01
