@@ -20,10 +20,7 @@ NAMES = ["board", "tracks", "drive", "poses", "imu at 100 Hz", "imu at 200 Hz", 
 MOST_BIAS = 4.5  # standard deviations of a mean; an honest component exceeds it once in 150 000
 
 
-RATES = [name for name in NAMES if name.startswith("imu at") and name != "imu at 100 Hz"]  # the lowest tells most
-
-
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.full if n in RATES else ()) for n in NAMES])
+@pytest.mark.parametrize("name", NAMES)
 def test_errors_are_as_large_as_their_standard_deviations(program: ModuleType, name: str):
     """The bounds hold every honest round but one in a thousand; `python benchmarks/nees.py` draws other seeds."""
     found = program.judge(program.CASES[name](), FIRST_SEED)
