@@ -306,17 +306,17 @@ def _check_motion(name: str, w: np.ndarray, u: np.ndarray) -> None:
 
 
 def _check_lateral_slip(name: str, slip: np.ndarray, motion: np.ndarray, forwards: np.ndarray) -> None:
-    """Raises EstimationError if no point of the vehicle moves along one axis only, as wheels force it to.
+    """Raises MotionContradictedError if no point of the vehicle moves along one axis only, as wheels force it to.
 
     slip (n,) [m/s]: lateral speed for the best axis; motion (n, 3): velocity [m/s] and yaw rate [rad/s]; forwards (n,):
-    rate that the wheels measure. If the motion explains it, the vehicle moves sideways; else MotionContradictedError.
+    rate that the wheels measure. If the motion explains it, the vehicle moves sideways.
     """
     share = np.linalg.norm(slip) / np.linalg.norm(motion[:, :2])
     if share <= MAX_LATERAL_SLIP:
         return
     left = forwards - motion @ _robust_fit(motion, forwards)
     if np.linalg.norm(left) < MAX_LATERAL_SLIP * np.linalg.norm(forwards):
-        raise EstimationError(
+        raise MotionContradictedError(
             f"{name}: its speed fits the motion along one axis, but the vehicle moves sideways as well, by "
             f"{share:.0%} of its speed. Drives with mecanum or omni wheels are not supported; give its odometry as a "
             "sensor of type: pose with kind: relative."
