@@ -25,7 +25,7 @@ from icalib.data.measurements import CornerStream, ImuStream, Measurements, Pose
 from icalib.errors import CalibrationError
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Rig, Settings
-from icalib.sensors.camera.read.corners import with_even_stamps
+from icalib.sensors.camera.read.detected_corners import with_even_stamps
 from icalib.sensors.stream import S, Stream
 from icalib.tools.simulation import Simulation, simulate
 

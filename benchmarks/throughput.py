@@ -21,7 +21,7 @@ from icalib.detection.decoding import ImageCorners
 from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.growth import MOTION_IMAGES
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Scene, Target
-from icalib.sensors.camera.read.corners import IN_TURN
+from icalib.sensors.camera.read.detected_corners import IN_TURN
 from icalib.tools.simulation import HandheldMotion, film, handheld, tag_map
 
 TARGETS: tuple[Target, ...] = (

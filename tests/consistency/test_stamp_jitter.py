@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Settings
-from icalib.sensors.camera.read.corners import with_even_stamps
+from icalib.sensors.camera.read.detected_corners import with_even_stamps
 from icalib.tools.simulation import Simulation, handheld, rig_for, simulate
 
 pytestmark = pytest.mark.slow

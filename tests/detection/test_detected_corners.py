@@ -16,7 +16,7 @@ from icalib.detection.decoding import ImageCorners, no_corners
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Markers, Scene
 from icalib.rig import Camera
-from icalib.sensors.camera.read import corners
+from icalib.sensors.camera.read import detected_corners
 
 GRID = AprilGrid(6, 6, 0.088, 0.3)
 CAMERA = Camera("cam0", "cam0/corners.csv", "pinhole-radtan", (8, 6))
@@ -73,16 +73,16 @@ class FakeDetector:
 @pytest.fixture
 def detector(monkeypatch, tmp_path) -> FakeDetector:
     fake = FakeDetector()
-    monkeypatch.setattr(corners, "detector_of", lambda target: fake)
+    monkeypatch.setattr(detected_corners, "detector_of", lambda target: fake)
     monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "cache"))
     return fake
 
 
 @pytest.mark.parametrize("together", [1, 6, 10, 256])
 def test_every_image_is_searched_once_and_stands_in_order(detector, monkeypatch, together):
-    monkeypatch.setattr(corners, "PACKED", together)
+    monkeypatch.setattr(detected_corners, "PACKED", together)
     done = []
-    found, notes = corners.find_corners(FakeRecording(), CAMERA, GRID, True, done.append)
+    found, notes = detected_corners.find_corners(FakeRecording(), CAMERA, GRID, True, done.append)
     assert sorted(detector.seen) == list(range(20))
     np.testing.assert_array_equal(found.stamps_ns, 1000 + np.arange(20))
     seen = [i for i in range(20) if i % 5 != 4]
@@ -98,9 +98,9 @@ def test_another_layout_is_looked_for_where_little_of_a_grid_is_found(detector, 
     whole = ImageCorners(point, np.zeros((found, 2)), 0.1 * one, one, np.zeros(found, np.int8))
     monkeypatch.setattr(detector, "detect", lambda image, before=(): whole)
     asked = []
-    monkeypatch.setattr(corners, "other_columns", lambda images, part: asked.append(part) or "")
-    monkeypatch.setattr(corners, "with_other_border", lambda images, tags, others: "")
-    corners.find_corners(FakeRecording(), CAMERA, GRID)
+    monkeypatch.setattr(detected_corners, "other_columns", lambda images, part: asked.append(part) or "")
+    monkeypatch.setattr(detected_corners, "with_other_border", lambda images, tags, others: "")
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert asked == ([GRID] if found < 0.5 * len(GRID.points) else [])
 
 
@@ -116,20 +116,20 @@ def test_many_single_tags_are_looked_for_once(detector, monkeypatch):
         ),
     )
     asked = []
-    monkeypatch.setattr(corners, "with_other_border", lambda views, tags, others: asked.append(tags.ids) or "")
+    monkeypatch.setattr(detected_corners, "with_other_border", lambda views, tags, others: asked.append(tags.ids) or "")
     recording = FakeRecording()
-    _, notes = corners.find_corners(recording, CAMERA, tags)
+    _, notes = detected_corners.find_corners(recording, CAMERA, tags)
     assert asked == [(7,), (8,)] and recording.read <= 3 * recording.n
     assert "tag0 is in 3, tag1 is in 3" in notes[0] and notes[1].startswith("fake.bag /cam0: tag7 and tag8 is never")
     asked.clear()
-    corners.find_corners(recording, CAMERA, Scene(tags.names[:7], tags.targets[:7]))
+    detected_corners.find_corners(recording, CAMERA, Scene(tags.names[:7], tags.targets[:7]))
     assert asked == [] and recording.read <= 5 * recording.n
 
 
 def test_a_second_run_looks_at_nothing(detector):
-    first = corners.find_corners(FakeRecording(), CAMERA, GRID)
+    first = detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     detector.seen.clear()
-    second = corners.find_corners(FakeRecording(), CAMERA, GRID)
+    second = detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert detector.seen == []
     for a, b in zip(vars(first[0]).values(), vars(second[0]).values(), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -138,35 +138,35 @@ def test_a_second_run_looks_at_nothing(detector):
 
 @pytest.mark.parametrize("other", [FakeRecording(19), FakeRecording(21)])
 def test_other_images_are_searched(detector, other):
-    corners.find_corners(FakeRecording(), CAMERA, GRID)
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     detector.seen.clear()
-    corners.find_corners(other, CAMERA, GRID)
+    detected_corners.find_corners(other, CAMERA, GRID)
     assert len(detector.seen) == other.n
 
 
 def test_another_target_is_searched_for(detector):
-    corners.find_corners(FakeRecording(), CAMERA, GRID)
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     detector.seen.clear()
-    corners.find_corners(FakeRecording(), CAMERA, AprilGrid(6, 6, 0.088, 0.25))
+    detected_corners.find_corners(FakeRecording(), CAMERA, AprilGrid(6, 6, 0.088, 0.25))
     assert len(detector.seen) == 20
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 truncated", b"no zip at all" * 50])
 def test_a_damaged_file_in_the_cache_is_no_file(detector, tmp_path, content):
-    corners.find_corners(FakeRecording(), CAMERA, GRID)
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     (kept,) = (tmp_path / "cache").iterdir()
     kept.write_bytes(content)
     detector.seen.clear()
-    found, _ = corners.find_corners(FakeRecording(), CAMERA, GRID)
+    found, _ = detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert len(detector.seen) == 20 and len(found.uv) == 16
 
 
 def test_nothing_is_kept_where_that_is_switched_off_or_cannot_be(detector, tmp_path, monkeypatch):
-    corners.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
     assert not (tmp_path / "cache").exists()
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("ICALIB_CACHE", str(tmp_path / "file"))
-    found, _ = corners.find_corners(FakeRecording(), CAMERA, GRID)
+    found, _ = detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert len(found.uv) == 16
 
 
@@ -174,7 +174,7 @@ def test_few_images_wait_in_memory(detector, monkeypatch):
     """The reader never runs ahead of the detectors by more than the bound: turns that wait, one that is made, and those
     that are searched."""
     monkeypatch.setattr(image_work, "core_count", lambda: 2)
-    monkeypatch.setattr(corners, "IN_TURN", 4)
+    monkeypatch.setattr(detected_corners, "IN_TURN", 4)
     recording, ahead = FakeRecording(60), []
     plain = detector.detect
     gate = threading.Semaphore(0)
@@ -185,7 +185,7 @@ def test_few_images_wait_in_memory(detector, monkeypatch):
         return plain(image, before)
 
     monkeypatch.setattr(detector, "detect", slow)
-    corners.find_corners(recording, CAMERA, GRID, keep=False)
+    detected_corners.find_corners(recording, CAMERA, GRID, keep=False)
     assert max(ahead) <= (2 + 2) * 4
 
 
@@ -194,8 +194,8 @@ def test_few_images_wait_in_memory(detector, monkeypatch):
 def test_what_leads_the_search_does_not_depend_on_the_number_of_threads(detector, monkeypatch, workers, most, images):
     """Each image is searched after those of its turn, in order: 6 images, or as many as have `most` bytes."""
     monkeypatch.setattr(image_work, "core_count", lambda: workers)
-    monkeypatch.setattr(corners, "IN_TURN", 6)
-    monkeypatch.setattr(corners, "BYTES_IN_TURN", most)
+    monkeypatch.setattr(detected_corners, "IN_TURN", 6)
+    monkeypatch.setattr(detected_corners, "BYTES_IN_TURN", most)
     led, plain = {}, detector.detect
 
     def noted(image: np.ndarray, before=()) -> ImageCorners:
@@ -203,7 +203,7 @@ def test_what_leads_the_search_does_not_depend_on_the_number_of_threads(detector
         return plain(image, before)
 
     monkeypatch.setattr(detector, "detect", noted)
-    corners.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
+    detected_corners.find_corners(FakeRecording(), CAMERA, GRID, keep=False)
     seen = [[float(i)] if i % 5 != 4 else [] for i in range(20)]
     assert led == {i: seen[max(i - 3, i - i % images) : i] for i in range(20)}
 
@@ -211,13 +211,13 @@ def test_what_leads_the_search_does_not_depend_on_the_number_of_threads(detector
 def test_an_interrupted_search_keeps_nothing(detector, tmp_path):
     detector.fail_at = 11
     with pytest.raises(KeyboardInterrupt):
-        corners.find_corners(FakeRecording(), CAMERA, GRID)
+        detected_corners.find_corners(FakeRecording(), CAMERA, GRID)
     assert not list(Path(tmp_path).rglob("*.npz"))
 
 
 def test_images_of_another_size_are_refused(detector):
     with pytest.raises(RecordingError, match="images have 6 x 6 px, but cam0 8 x 6; correct its resolution"):
-        corners.find_corners(FakeRecording(width=6), CAMERA, GRID)
+        detected_corners.find_corners(FakeRecording(width=6), CAMERA, GRID)
 
 
 @pytest.mark.parametrize("files", [False, True])
@@ -226,7 +226,7 @@ def test_damaged_images_are_named(detector, files):
     recording = FakeRecording(damaged=(7, 11))
     recording.files = files
     for _ in range(2):
-        found, notes = corners.find_corners(recording, CAMERA, GRID)
+        found, notes = detected_corners.find_corners(recording, CAMERA, GRID)
         assert len(found.stamps_ns) == 18
         which = "left7.png" if files else "at 1007 ns"
         assert notes[-1] == f"fake.bag /cam0: 2 damaged images were ignored, the first {which}."
@@ -235,4 +235,4 @@ def test_damaged_images_are_named(detector, files):
 
 def test_damaged_images_are_left_out_and_all_damaged_are_refused(detector):
     with pytest.raises(RecordingError, match="fake.bag /cam0"):
-        corners.find_corners(FakeRecording(size=20), CAMERA, GRID)
+        detected_corners.find_corners(FakeRecording(size=20), CAMERA, GRID)

@@ -19,7 +19,7 @@ from icalib.detection.images import sightings, without_rare_tags
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Markers, Scene, Target
 from icalib.rig import Camera
-from icalib.sensors.camera.read import corners
+from icalib.sensors.camera.read import detected_corners
 from icalib.tools.simulation import Imaging, Renderer, Shot, film, handheld, sheets_of, tag_map
 
 pytest.importorskip("cv2")
@@ -49,7 +49,7 @@ class Shown(StandIn):
 
 
 def found_in(images: list[np.ndarray], target: Target):
-    return corners.find_corners(Shown(images), CAMERA, target, keep=False)
+    return detected_corners.find_corners(Shown(images), CAMERA, target, keep=False)
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def test_what_is_kept_goes_by_the_whole_scene(shots: list[Shot], tmp_path, monke
     recording = Shown([shot.pixels for shot in shots[:2]])
     scenes = [Scene(("a", "b"), (TAGS, AprilGrid(3, 3, 0.1, spacing))) for spacing in (0.3, 0.31)]
     for scene in (scenes[0], scenes[0], scenes[1], replace(TAGS, ids=(40,)), TAGS):
-        corners.find_corners(recording, CAMERA, scene)
+        detected_corners.find_corners(recording, CAMERA, scene)
     assert len(list(tmp_path.iterdir())) == 4
 
 

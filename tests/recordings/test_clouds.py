@@ -15,7 +15,7 @@ from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
-from icalib.sensors.lidar import read as recorded_scans
+from icalib.sensors.lidar.read import scans as recorded_scans
 from icalib.sensors.lidar.read.point_clouds import checked_lidar
 from icalib.tools.inspection import draft_rig, inspect_recording
 

@@ -9,7 +9,7 @@ import pytest
 from tests.cases import each
 
 from icalib.data.measurements import CornerStream, TrackStream
-from icalib.sensors.camera.read.corners import with_even_stamps
+from icalib.sensors.camera.read.detected_corners import with_even_stamps
 from icalib.tools.simulation import handheld, simulate
 
 RATE_HZ, SECONDS = 20.0, 20.0

@@ -15,7 +15,7 @@ from icalib.data.tables import TableKind, holds, named, read_table
 from icalib.errors import RecordingError, RigError
 from icalib.rig import Camera, ImuSensor, PoseSensor, Rig, TableLayout, Wheels, by_name
 from icalib.rig.file import load_rig, rig_from_dict, rig_to_dict
-from icalib.sensors.camera import read as recorded_tracks
+from icalib.sensors.camera.read import tracks as recorded_tracks
 from icalib.sensors.imu.read import IMU
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.pose.read import readings as pose_readings

@@ -16,7 +16,7 @@ from tests.cases import each
 from icalib.data.recordings import BagRecording
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
-from icalib.sensors.lidar import read
+from icalib.sensors.lidar.read import scans
 
 CLOUD = (
     "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\nCustomPoint[] points\n"
@@ -55,7 +55,7 @@ def bag_of(path: Path, package: str, form: str, frame: str, cut: int = 0) -> Bag
 def test_points_and_their_times(tmp_path, package, form, frame):
     bag = bag_of(tmp_path / "run.bag", package, form, frame)
     assert [(t.kind, t.count) for t in bag.topics()] == [("points", SCANS)]
-    stream = read(bag, Lidar("lidar0", ""))
+    stream = scans(bag, Lidar("lidar0", ""))
     assert stream.stamps_ns.tolist() == [ORIGIN + k * 100_000_000 for k in range(SCANS)]
     np.testing.assert_array_equal(stream.xyz, XYZ.reshape(-1, 3))
     np.testing.assert_allclose(stream.offset_s, np.tile(SINCE * 1e-9, SCANS), atol=1e-8)
@@ -67,4 +67,4 @@ def test_points_and_their_times(tmp_path, package, form, frame):
 def test_a_message_that_is_cut_off(tmp_path, form, cut):
     bag = bag_of(tmp_path / "run.bag", "livox_ros_driver2", form, "f", cut)
     with pytest.raises(RecordingError, match=f"/livox/lidar: the message received at {ORIGIN + 10} ns is damaged"):
-        read(bag, Lidar("lidar0", ""))
+        scans(bag, Lidar("lidar0", ""))

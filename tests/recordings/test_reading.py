@@ -15,7 +15,7 @@ from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets import AprilGrid
 from icalib.rig import Camera, ImuSensor, Rig, by_name
-from icalib.sensors.camera.read.corners import checked_corners
+from icalib.sensors.camera.read.detected_corners import checked_corners
 from icalib.sensors.imu.spec import class_noise
 
 ORIGIN = 1_404_733_405_732_800_001

@@ -15,7 +15,7 @@ from icalib.data.recordings import FolderRecording, open_recording, read_measure
 from icalib.errors import RecordingError
 from icalib.rig import Lidar
 from icalib.rig.file import load_rig
-from icalib.sensors.lidar import read as scans
+from icalib.sensors.lidar.read import scans
 from icalib.sensors.lidar.read.point_clouds import checked_lidar
 
 LIDAR = Lidar("lidar0", "lidar0/scans.npz")

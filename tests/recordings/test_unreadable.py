@@ -18,7 +18,7 @@ from icalib.rig import Camera, ImuSensor, Lidar
 from icalib.sensors.camera.read import has_corners
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise
-from icalib.sensors.lidar import read as scans
+from icalib.sensors.lidar.read import scans
 from icalib.tools.inspection import inspect_recording
 
 POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a2146\nsize 12345\n"

@@ -12,7 +12,7 @@ from icalib.data.recordings import decode, open_recording
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Markers
 from icalib.rig import Camera
-from icalib.sensors.camera.read.corners import find_corners
+from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.tools.inspection import inspect_recording
 
 cv2 = pytest.importorskip("cv2")

@@ -19,7 +19,7 @@ from icalib.data.stamps import Window, start_of
 from icalib.errors import RecordingError
 from icalib.pipeline import calibrate
 from icalib.rig import Camera, ImuSensor, PoseSensor, TwoSources, Wheels
-from icalib.sensors.camera import read as recorded_tracks
+from icalib.sensors.camera.read import tracks as recorded_tracks
 from icalib.sensors.imu.read import ImuHalves
 from icalib.sensors.imu.read import readings as imu_readings
 from icalib.sensors.imu.spec import class_noise

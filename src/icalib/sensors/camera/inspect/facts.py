@@ -21,7 +21,7 @@ from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.targets import Target
 from icalib.sensors.camera.read import CameraInfo
 from icalib.sensors.camera.read import corners as recorded_corners
-from icalib.sensors.camera.read.corners import find_corners
+from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.sensors.camera.spec import Camera
 from icalib.tools.inspection.facts import (
     Inspection,

@@ -16,7 +16,7 @@ from icalib.data.tables import STAMP, TableFile, TableKind, read_table
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.rig import PLAIN_TABLE, Rig
-from icalib.sensors.camera.read.corners import (
+from icalib.sensors.camera.read.detected_corners import (
     CORNER_TABLE,
     IMAGE_RATE_HZ,
     CornerRows,

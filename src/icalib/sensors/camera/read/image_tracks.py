@@ -39,7 +39,7 @@ from icalib.detection.tracker import (
 )
 from icalib.errors import RecordingError
 from icalib.rig import Camera
-from icalib.sensors.camera.read.corners import camera_images, image_topic
+from icalib.sensors.camera.read.detected_corners import camera_images, image_topic
 from icalib.sensors.camera.stream import shared_rows
 
 # Feature tracks from the images of a recording: tracked on all cores, and cached for the next run.
