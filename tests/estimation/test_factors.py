@@ -766,12 +766,12 @@ SAMPLES = {
 
 
 def factors_in_the_source():
-    """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of the modules `residual`
-    and `*_factor` of sensors and of what they share."""
+    """Whatever adds to the normal equations: classes with `accumulate`, functions named so, of modules `residual`,
+    `*_factor` and `arrowhead` of sensors and of what they share."""
     found = set()
     packages = (icalib.sensors, icalib.optim)
     for module in (m for p in packages for m in pkgutil.walk_packages(p.__path__, f"{p.__name__}.")):
-        if module.name.endswith((".residual", "_factor")):
+        if module.name.endswith((".residual", "_factor", ".arrowhead")):
             for key, thing in vars(importlib.import_module(module.name)).items():
                 own = getattr(thing, "__module__", None) == module.name and not inspect.isabstract(thing)
                 if own and (hasattr(thing, "accumulate") or (key.startswith("accumulate") and callable(thing))):
