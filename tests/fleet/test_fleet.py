@@ -7,6 +7,7 @@ import os
 import shutil
 import sqlite3
 from contextlib import closing
+from itertools import count
 from pathlib import Path
 
 import pytest
@@ -86,8 +87,7 @@ def test_changed_inputs_do_a_job_again_and_say_so(fleet_folder: Path, workshop, 
     with (fleet_folder / "rig.yaml").open("a") as file:
         file.write("# by hand\n")
     assert fleet(fleet_folder).again == dict.fromkeys(NAMES, "the rig file changed")
-    for module in ("inputs", "store"):
-        monkeypatch.setattr(f"icalib.tools.fleet.{module}.program", lambda: "another")
+    monkeypatch.setattr("icalib.tools.fleet.result.program", lambda: "another")
     assert fleet(fleet_folder).again == dict.fromkeys(NAMES, "icalib changed")
     assert len(workshop.done) == 4 + 1 + 1 + 4 + 4 and fleet(fleet_folder).again == {}
 
@@ -197,7 +197,8 @@ def test_a_job_that_killed_its_workers_is_reported_and_tried_again_the_next_time
 
 
 def test_another_icalib_on_a_worker_is_refused(fleet_folder: Path, workshop, monkeypatch):
-    monkeypatch.setattr("icalib.tools.fleet.result.program", lambda: "of the worker")
+    programs = (f"program {k}" for k in count())  # another one wherever it is asked for
+    monkeypatch.setattr("icalib.tools.fleet.result.program", lambda: next(programs))
     with pytest.raises(CalibrationError, match="a worker of the cluster runs another version of icalib"):
         fleet(fleet_folder)
 
