@@ -1,7 +1,7 @@
 """A module imports only from lower levels (docs/architecture.md), so that each stage can be read and run alone.
 
 Every folder of the package has a level; within a top folder imports are free, but not in a circle. In the folder of a
-sensor each facet (`icalib.sensors.FACETS`) has a level as well, the same for all sensors.
+sensor each facet (`FACETS`) has a level as well, the same for all sensors.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import icalib
-from icalib.sensors import FACETS, SENSOR_KINDS
+from icalib.sensors import SENSOR_KINDS
 
 SOURCE = Path(icalib.__file__).parent
 PAGE = Path(__file__).parents[1] / "docs" / "architecture.md"
@@ -47,6 +47,8 @@ EVERYWHERE = {"errors", "kinds"}  # `kinds` lists what the sensors do in each st
 # Methods of a result, for users, that call a higher level when they are called.
 UPWARDS = {("result", "export"), ("result", "report")}
 ROOT_NAMES = {"__version__"}  # of icalib/__init__.py, which any module may ask for
+# Modules or packages of fixed names in the folder of a sensor, each for one stage.
+FACETS = ("spec", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")
 TOOL_FACETS = ("simulate", "inspect")
 DATA_FACETS = ("spec", "stream", "read", "simulate")
 ESTIMATOR = ("optim", "motion", "model", "sensors", "estimate", "initialize", "observability", "validation", "pipeline")

@@ -93,7 +93,7 @@ def test_no_module_outside_of_the_folders_of_sensors_names_a_kind():
         ("from icalib.sensors import pose", {"pose"}),
         ("names = [w.name for w in inputs.rig.wheels]", {"rig.wheels"}),
         ("poses = poses_at(m.poses, found.poses)", {"m.poses"}),
-        ("from icalib.sensors import call_kind\nfrom icalib.geometry import pose", set()),
+        ("from icalib.kinds import readers\nfrom icalib.geometry import pose", set()),
         (
             "Rays = tuple[float, float]  # its own, though a kind has a class Rays\ndef f(r: Rays): ...",
             set(),

@@ -232,7 +232,7 @@ def all_off_below(turn: float, way: float, offset: float) -> list[Check]:
 
 def lever_arm_is_at_the_guess(run: Run) -> None:
     """Open along the axis of rotation, alike for both cameras, and held there between the guesses. What the cameras see
-    of each other is determined: only their common shift is held."""
+    of each other is determined: only their common shift is fixed."""
     R = run.simulation.truth.R_world_imu
     axis = np.linalg.svd(Rotation.from_matrix(R[0].T @ R[::20]).as_rotvec(), full_matrices=False)[2][0]
     assert any("translation" in sentence for sentence in run.result.unobservable)
@@ -296,7 +296,7 @@ CASES: dict[str, Case] = {
         [known(), std_below("imu0.intrinsics", 0.01)],
         imu_intrinsics_free,
     ),
-    # What is open is said, held where the guess has it, and the rest is right.
+    # What is unobservable is said and fixed at the guess, and the rest is right.
     "planar motion, guessed": Case(turning("planar"), [known(), lever_arm_is_at_the_guess], guessed("free", 0)),
     "planar motion, with priors": Case(
         turning("planar"), [known(), lever_arm_is_at_the_guess], guessed("prior", 0), full=True

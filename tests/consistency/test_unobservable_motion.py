@@ -13,7 +13,7 @@ from icalib.rig import Rig
 from icalib.tools.simulation import Simulation, rig_for, simulate, with_drawn_guess
 from icalib.tools.simulation.rigs import Treatment
 
-NOT_CREEPING = steps_below(40)  # with the world free to undo what is held, one pass alone took 50
+NOT_CREEPING = steps_below(40)  # with the world free to undo what is fixed, one pass alone took 50
 SPIN_SECONDS = 10.0  # after 8 s of noisy spinning the baseline is called known, 19 standard deviations off
 
 
@@ -80,8 +80,8 @@ CASES: dict[str, Case] = {
         for motion, seed in (("single-axis", 1), ("single-axis", 3), ("standing", 1))
     },
     # On a straight line a noisy IMU makes four fifths of the information on the clocks, and what is left is within its
-    # scatter. With the LiDAR's held at a guess 20 ms off, features fitted 1.14 times worse than noise explains, about a
-    # principal point that was 90 px off.
+    # scatter. With the LiDAR's fixed at a guess 20 ms off, features fitted 1.14 times worse than noise explains, about
+    # a principal point that was 90 px off.
     "what noise hides is not forced to the guess": Case(
         of("straight-line", 10.0, 2),
         [known(), leaves_something_open, features_fit(1.05)],

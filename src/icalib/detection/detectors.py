@@ -31,8 +31,6 @@ from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
 
 # Chooses the detector of each target.
 
-# One file for each kind of target: from a grey image to its corners.
-
 _SAME_PX = 3.0  # corners closer together are the same
 
 

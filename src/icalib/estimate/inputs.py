@@ -11,8 +11,9 @@ import numpy as np
 
 from icalib.data.measurements import Measurements, Part, Stream, join
 from icalib.geometry.targets.base import BOARD
+from icalib.kinds import models
 from icalib.model.bodies import Bodies
-from icalib.model.sensor_model import all_models, clocks_of, model_of
+from icalib.model.sensor_model import clocks_of, model_of
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.point_planes import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
@@ -94,8 +95,8 @@ class Inputs:
 def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
     """Inputs of one or several recordings, joined. whole: inputs whose clock shifts are used, if `recordings` are some
     of their streams."""
-    bodies = next(b for model in all_models() if (b := model.target_bodies(rig, recordings)) is not None)
-    for model in all_models():
+    bodies = next(b for model in models().values() if (b := model.target_bodies(rig, recordings)) is not None)
+    for model in models().values():
         recordings = [model.prepared(rig, bodies, r) for r in recordings]
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
     joined, parts = join(rig, recordings, shifts)

@@ -14,7 +14,8 @@ from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import FRAME_INFORMATION, IN_THE_WORLD, Problem, hold_frame
 from icalib.estimate.solver import Outcome, posterior
-from icalib.model.sensor_model import Fit, all_models
+from icalib.kinds import models
+from icalib.model.sensor_model import Fit
 from icalib.motion.factor import FactorKey, FitKey, RawSize, ResidualRows, Residuals, Squares, StateDifference
 from icalib.optim.arrowhead import (
     Draw,
@@ -127,7 +128,7 @@ class ClusterCovariances:
 
 def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
     """Cluster-robust (sandwich) covariances of the calibration parameters."""
-    every = [c for model in all_models() for c in model.clusters(problem.factors)]
+    every = [c for model in models().values() for c in model.clusters(problem.factors)]
     gradients = _cluster_gradients(problem, outcome, [c.of_factor for c in every]) if every else []
     regions, tracks = [], None
     for clusters, b in zip(every, gradients, strict=True):

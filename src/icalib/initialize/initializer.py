@@ -22,12 +22,9 @@ from icalib.kinds import initializers
 from icalib.motion.imu_data import imu_data
 from icalib.optim.state import Key, State
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
-from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.sensor import MOUNTED_NAMES, TRANSLATION
 
-# How the sensors of one kind take part in the initial guess.
-#
-# The facet `initialize` of a kind holds an `Initializer` as `INITIALIZER`. A kind overrides what it supports. The
+# How the sensors of one kind take part in the initial guess, an `Initializer`. A kind overrides what it supports. The
 # defaults are those of a sensor that does not show the motion and needs no guess.
 #
 # Largest spacing of keyframes if smooth motion is assumed in place of an IMU.
@@ -39,8 +36,6 @@ from icalib.sensors.sensor import MOUNTED_NAMES, TRANSLATION
 # Increments span a whole spacing h, and their noise grows with sqrt(h).
 #
 # The upward direction: by gravity, or by a level frame of a sensor if gravity is not observed.
-
-# Steps that initial guesses of several kinds of sensors share.
 
 S = TypeVar("S", bound=Sensor)
 Values = dict[Key, np.ndarray]
@@ -180,20 +175,15 @@ class Initializer(Generic[S]):
 NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 
-def initializer(kind: str) -> Initializer[Any]:
-    """The initializer of a kind of sensor."""
-    return initializers()[kind]
-
-
 def initializer_of(sensor: Sensor) -> Initializer[Any]:
     """The initializer of the sensor's kind."""
-    return initializer(sensor.sensor_type)
+    return initializers()[sensor.sensor_type]
 
 
 def kinds_of(rig: Rig) -> list[Initializer[Any]]:
     """Initializers of all kinds of which `rig` has a sensor, in the order of `SENSOR_KINDS`."""
     types = {s.sensor_type for s in rig.mounted}
-    return [initializer(kind) for kind in SENSOR_KINDS if kind in types]
+    return [initializer for kind, initializer in initializers().items() if kind in types]
 
 
 def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
@@ -212,8 +202,7 @@ def place_sensors(inputs: Inputs, state: State, sensors: Iterable[Sensor]) -> Va
     last."""
     out: Values = {}
     sensors = list(sensors)
-    kinds = [initializer(kind) for kind in SENSOR_KINDS]
-    for kind in sorted(kinds, key=lambda kind: kind.asks_for_vertical):
+    for kind in sorted(initializers().values(), key=lambda kind: kind.asks_for_vertical):
         if of_kind := [s for s in sensors if initializer_of(s) is kind]:
             out |= kind.place(inputs, replace(state, values=state.values | out), of_kind)
     return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
@@ -19,7 +19,6 @@ from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import EstimatedMotion, instants
 from icalib.optim.state import Entry, Key, Layout, State, in_recording
 from icalib.rig import ParameterSpec, Rig, Sensor, Settings, scene
-from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.sensor import TIME_OFFSET
 
 S = TypeVar("S", bound=Sensor)
@@ -193,26 +192,15 @@ class SensorModel(Generic[S, N]):
 
 def model_of(sensor: Sensor) -> SensorModel[Any, Any]:
     """The model of a sensor's kind."""
-    return kind_model(sensor.sensor_type)
+    return models()[sensor.sensor_type]
 
 
 def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], list[Sensor]]]:
     """(model, sensors) of each kind that occurs in `sensors`, in the order of `SENSOR_KINDS`."""
     every = list(sensors)
-    for kind in SENSOR_KINDS:
+    for kind, model in models().items():
         if sensors_of_kind := [s for s in every if s.sensor_type == kind]:
-            yield kind_model(kind), sensors_of_kind
-
-
-def all_models() -> Iterator[SensorModel[Any, Any]]:
-    """The models of all kinds, in the order of `SENSOR_KINDS`."""
-    return map(kind_model, SENSOR_KINDS)
-
-
-@cache
-def kind_model(kind: str) -> SensorModel[Any, Any]:
-    """The model of one of `SENSOR_KINDS`."""
-    return models()[kind]
+            yield model, sensors_of_kind
 
 
 def own_entries(

@@ -1,12 +1,10 @@
 """The kinds of sensors: one folder each. `CONTRIBUTING.md` lists what a new kind has, and where it is registered.
 
-A facet is a module or package of a fixed name in the folder of a kind that serves one stage of the program: see
-`FACETS`. It holds one object of the class that the stage defines; `kinds.py` lists these objects.
+A module or package of a fixed name in the folder of a kind serves one stage of the program. It holds one object of the
+class that the stage defines; `kinds.py` lists these objects.
 """
 
 from __future__ import annotations
 
 # Order of sensors in layouts and results; sensors of one kind are in the order of the rig file.
 SENSOR_KINDS = ("imu", "camera", "lidar", "wheels", "pose", "position")
-# Names of facets. Each is a separate import level in tests/test_layers.py.
-FACETS = ("spec", "stream", "read", "model", "initialize", "assess", "show", "simulate", "inspect")

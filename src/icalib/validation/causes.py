@@ -326,9 +326,8 @@ def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) ->
 BINS, WINDOWS = 64, (3, 6, 9)  # bins of the recording, and of a window: a shock affects a few keyframes around it
 AT_ONE_TIME = 0.5  # share of the misfit in one window
 NEARLY_ALL = 0.9  # of the largest share of a window
-LARGE_WINDOW = (
-    3.0  # times the median chi^2 of a window; below it, the number of measurements may explain the difference
-)
+# Times the median chi^2 of a window; below it, the number of measurements may explain the difference.
+LARGE_WINDOW = 3.0
 
 
 @dataclass(frozen=True)

@@ -516,7 +516,7 @@ def chi2_above(x: float, dof: int) -> float:
     return p + sum(exp(-half) * half ** (0.5 * k - 1.0) / gamma(0.5 * k) for k in range(4 - dof % 2, dof + 1, 2))
 
 
-# Units of tolerances; a module without imports, so that the command line starts fast.
+# Units of tolerances.
 
 # Tolerances of differences without a known standard deviation.
 DEFAULT_TOLERANCES = {"deg": 0.1, "mm": 5.0, "ms": 1.0, "px": 1.0, "percent": 0.1}

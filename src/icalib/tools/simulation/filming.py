@@ -56,9 +56,8 @@ from icalib.tools.simulation.trajectory import TrueTrajectory
 # Each pixel is divided into 2 x 2 cells. A cell has a ray through the lens, an instant within the exposure, and the
 # mean brightness of its footprint on the surface that the ray meets.
 
-# Simulates recordings with rendered images instead of corners; stamps and motion are those of `simulate`.
-#
-# Images are rendered by threads on demand, a few ahead, so that a recording is never in memory as a whole.
+# Stamps and motion are those of `simulate`. Images are rendered by threads on demand, a few ahead, so that a recording
+# is never in memory as a whole.
 #
 # People in front of a camera: upright boxes that follow it with a delay, and sway from side to side.
 

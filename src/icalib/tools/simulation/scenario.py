@@ -23,11 +23,7 @@ from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, Texture, dead_leaves
 from icalib.tools.simulation.trajectory import Drive, Features, TrueTrajectory
 
-# Base class of simulated sensors other than IMU and cameras.
-#
-# The class of a kind is `icalib.sensors.KIND.simulate.SIMULATED`.
-
-# Description of a simulation: the rig, its motion, the room and the noise.
+# Base class of simulated sensors other than IMU and cameras; `kinds.py` lists those of all kinds.
 
 BagEvent = tuple[int, Callable[[BagWriter], Any]]  # instant of reception on the IMU's clock [ns]; maker of the message
 

@@ -25,8 +25,6 @@ from icalib.sensors.camera.stream import TrackStream, shared_rows
 # rotations about the main axis of the motion are tried on a grid, because a robot on a floor rotates about this axis
 # only.
 
-# Initial guess of cameras with feature tracks.
-
 PAIR_STEPS_S = (0.5, 1.0)  # s between the images of a pair; over shorter times the motion is small against ray errors
 MAX_EPIPOLAR_PAIRS = 300  # pairs of images for each of `PAIR_STEPS_S`
 MIN_EPIPOLAR_PAIRS = 20  # pairs of images; fewer contain too little motion to determine seven unknowns

@@ -152,9 +152,8 @@ INITIALIZER = PoseInitializer()
 
 MIN_POSE_RATE_HZ = 2.0  # lowest rate of a moving sensor, as angular rates are means between poses
 FIT_STEP_S = 0.4  # between poses that test the fit, as noise dominates the motion between successive poses
-MAX_GRAVITY_ERROR = (
-    0.5  # relative error of gravity: up to it the scale of positions may be wrong, above it the accelerometer's unit is
-)
+# Relative error of gravity: up to it the scale of positions may be wrong, above it the accelerometer's unit is
+MAX_GRAVITY_ERROR = 0.5
 
 
 def pose_values(inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> dict[Key, np.ndarray]:
