@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from tests.consistency.recordings import without_imu
 from tests.consistency.test_level_frame import level
-from tests.initialize.test_pose_conventions import conjugated, inverted, w_first, y_up
+from tests.sensors.pose.test_pose_conventions import conjugated, inverted, w_first, y_up
 
 from icalib.errors import EstimationError
 from icalib.initialize.assumed_motion import guess_with_assumed_motion

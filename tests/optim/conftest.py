@@ -1,0 +1,3 @@
+"""Normal equations as dense matrices."""
+
+from tests.setups import dense  # noqa: F401 fixtures

@@ -1,0 +1,141 @@
+"""Errors of fixes that last: a slow offset that is a random walk, and bursts of wrong fixes."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from tests.sensors.position.test_position_runs import antenna, errors, recorded
+
+from icalib.optim.state import State, make_layout
+from icalib.pipeline import calibrate_measurements
+from icalib.rig import Settings
+from icalib.sensors.position.residual import OffsetWalk, bursts_of, knot_entries, knot_keys, outliers_of
+from icalib.sensors.position.stream import PositionStream
+from icalib.tools.simulation import rig_for, simulate
+
+WALK = 0.02  # m/sqrt(s)
+
+
+def test_the_offset_between_knots_is_that_of_brownian_bridges():
+    """Mean and variance given the knots, against drawn walks of 16 steps between two knots."""
+    stamps = np.arange(0, 60_000_000_001, 78_125_000)  # 16 fixes between two of 48 knots over 60 s
+    stream = PositionStream("gnss0", stamps, np.zeros((len(stamps), 3)), np.zeros((0, 3, 3)))
+    walk = OffsetWalk.of(stream, stream.seconds, WALK, make_layout(knot_entries("gnss0", 1)))
+    keys, rng = knot_keys("gnss0", 0, 1), np.random.default_rng(1)
+    drawn = np.cumsum(WALK * np.sqrt(0.078125) * rng.standard_normal((2000, len(stamps) - 1)), axis=1)
+    drawn = np.concatenate([np.zeros((2000, 1)), drawn], axis=1)
+    from_line = np.zeros((2000, len(stamps)))
+    for k in range(2000):
+        knots = {key: np.full(3, drawn[k, 16 * (j + 1)]) for j, key in enumerate(keys)}
+        state = State(*(np.zeros(0) for _ in range(5)), values=knots)
+        from_line[k] = drawn[k] - walk.offsets(slice(None), state)[:, 0]
+    np.testing.assert_allclose(from_line.mean(axis=0), 0.0, atol=0.1 * WALK)
+    np.testing.assert_allclose(from_line.var(axis=0), walk.bridge_variance, atol=0.15 * walk.bridge_variance.max())
+    assert walk.bridge_variance.max() == pytest.approx(WALK**2 * 1.25 / 4.0)
+
+
+def test_bursts_and_single_outliers_are_found():
+    """A burst that pulled the trajectory to itself: its residuals are small in its middle, and step at its ends."""
+    t, rng = np.arange(300) / 5.0, np.random.default_rng(3)
+    raw, sigma = 0.02 * rng.standard_normal((300, 3)), np.full((300, 3), 0.04)
+    raw[100:150] += [2.0, -1.0, 0.0]
+    raw -= np.exp(-(((t - 25.0) / 4.0) ** 2))[:, None] * [2.0, -1.0, 0.0]
+    np.testing.assert_array_equal(np.flatnonzero(bursts_of(t, raw, sigma)), np.arange(100, 150))
+    raw = 0.02 * rng.standard_normal((300, 3))
+    raw[7, 2] += 0.2
+    raw[200:202, 0] -= 0.3
+    np.testing.assert_array_equal(np.flatnonzero(outliers_of(raw / sigma, raw, 4.0)), [7, 200, 201])
+    assert not outliers_of(1e-3 * raw / sigma, 1e-3 * raw, 4.0).any()  # all are closer than 5 cm
+
+
+def test_a_simulated_walk_and_bursts_are_as_large_as_stated():
+    still = antenna(position_noise=0.0, random_walk=WALK)
+    t = np.arange(200_000) / 5.0
+    steps = np.diff(still._errors(t, np.random.default_rng(2))[::25], axis=0)
+    assert steps.std() == pytest.approx(WALK * np.sqrt(5.0), rel=0.02)
+    error = antenna(position_noise=0.0, bursts=0.2, burst_s=3.0)._errors(t, np.random.default_rng(2))
+    wrong = np.linalg.norm(error, axis=1) > 0.0
+    assert wrong.mean() == pytest.approx(0.2, abs=0.02)
+    assert np.linalg.norm(error[wrong], axis=1).min() > 1.5
+    assert wrong.sum() / np.sum(np.diff(wrong.astype(int)) > 0) == pytest.approx(15.0, rel=0.1)  # fixes of a burst
+
+
+def walking(seed, density, known=WALK, **fields):
+    """Error (4,), its standard deviations, NEES, and the result of 60 s in free motion with the default settings."""
+    sim = recorded("free", antenna(random_walk=density, **fields), seed=seed)
+    rig = rig_for(sim.scenario, settings=Settings()).with_("gnss0", position_random_walk=known)
+    result = calibrate_measurements(rig, [sim.measurements])
+    error, std = errors(result, sim)
+    own = [k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.")]
+    return error, std, error @ np.linalg.solve(result.covariance[np.ix_(own, own)], error), result
+
+
+def advised(result):
+    """The density that a warning on correlated residuals advises."""
+    (warning,) = (w for w in result.warnings if "correlated" in w)
+    assert "the cause is unknown" in warning and "multipath" not in warning
+    (density,) = re.findall(r"position_random_walk: ([0-9.]+[0-9])", warning)
+    return float(density)
+
+
+@pytest.mark.slow
+def test_without_noise_the_walk_moves_nothing():
+    scenario = recorded("free", antenna(), duration_s=20.0).scenario
+    sim = simulate(replace(scenario, robot_noise_enabled=False, imu_noise_enabled=False), 1)
+    result = calibrate_measurements(rig_for(scenario).with_("gnss0", position_random_walk=WALK), [sim.measurements])
+    error, _ = errors(result, sim)
+    assert np.abs(error[:3]).max() < 1e-3
+    assert abs(error[3]) < 2e-4
+
+
+@pytest.mark.slow
+def test_a_slow_offset_that_is_not_modelled_is_named():
+    """And the warning tells its density, from the residuals."""
+    *_, result = walking(2, WALK, 0.0)
+    assert advised(result) == pytest.approx(WALK, rel=0.4)
+    error, std, _, result = walking(2, WALK)
+    assert (np.abs(error) < 3.5 * std).all()
+    assert not any("correlated" in w for w in result.warnings)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [11, *(pytest.param(k, marks=pytest.mark.full) for k in (13, 17))])
+def test_bursts_of_wrong_fixes_are_rejected(seed):
+    """A fifth of the fixes is off by metres, for 4 s on average."""
+    error, std, _, result = walking(seed, 0.0, 0.0, bursts=0.2)
+    assert (np.abs(error) < 4.0 * std).all()
+    assert std[:3].max() < 0.015
+    assert any("outliers" in note for note in result.notes)
+
+
+@pytest.mark.full
+def test_errors_with_a_slow_offset_are_as_large_as_their_covariance_says():
+    found = [walking(seed, WALK)[2] for seed in range(20)]
+    low, high = chi2.ppf([0.005, 0.995], 4 * len(found)) / len(found)
+    assert low < np.mean(found) < high
+
+
+@pytest.mark.full
+def test_multipath_is_mostly_covered_by_the_walk_that_the_warning_advises():
+    """Gauss-Markov errors of 5 cm and 3 s. Over a short time they are a random walk of D sqrt(2 / T). The density that
+    is advised is a fifth smaller. Formal standard deviations are still too small, printed ones are not."""
+    alone, with_walk, printed, known = [], [], [], []
+    for seed in range(20, 26):
+        errors_of_fixes = {"drift_noise": 0.05, "drift_time_s": 3.0}
+        _, _, nees, result = walking(seed, 0.0, 0.0, **errors_of_fixes)
+        alone.append(nees)
+        known.append(advised(result))
+        error, std, nees, result = walking(seed, 0.0, known[-1], **errors_of_fixes)
+        with_walk.append(nees)
+        own = [k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.")]
+        covariance = result.covariance[np.ix_(own, own)]
+        root = std / np.sqrt(np.diag(covariance))  # empirical factors
+        printed.append(error @ np.linalg.solve(covariance * np.outer(root, root), error))
+    assert np.mean(known) == pytest.approx(0.05 * np.sqrt(2.0 / 3.0), rel=0.3)
+    assert np.mean(with_walk) < 0.6 * np.mean(alone)
+    low, high = chi2.ppf([0.005, 0.995], 4 * len(printed)) / len(printed)
+    assert low < np.mean(printed) < high
