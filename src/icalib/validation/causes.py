@@ -151,7 +151,7 @@ def unknown_words(rig: Rig, misfit: Misfit) -> str:
     checks = {
         "noise of the readings, fixed values and priors": True,
         "target size": rig.has_target,
-        "camera models and lenses that change": bool(rig.cameras),
+        "camera models, rolling shutters, and lenses that change": bool(rig.cameras),
         "swapped cameras": len(rig.cameras) > 1,
         "clocks that drift or jump, mounts that move, disturbances at one time": True,
     }
