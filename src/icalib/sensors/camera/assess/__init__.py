@@ -201,8 +201,8 @@ def _rolling_shutters(inputs: Inputs, estimate: Estimate) -> list[_Shutter]:
         _shutter(factor, out, estimate.outcome.state, inputs.sensor(factor.name).resolution[1])
         for factor, out in moving
     ]
-    found = sorted((s for s in shutters if s.share > ROLLING_SHARE), key=lambda s: -s.gain)
-    return [s for s in found if s.seconds * found[0].seconds > 0.0]
+    rolling = sorted((s for s in shutters if s.share > ROLLING_SHARE), key=lambda s: -s.gain)
+    return [s for s in rolling if s.seconds * rolling[0].seconds > 0.0]
 
 
 def _shutter(factor: CornerFactor, out: CornerOutput, state: State, rows: int) -> _Shutter:
