@@ -109,7 +109,7 @@ def sums(name: str, rig: Rig, measurements: Measurements) -> list[Figure]:
     """Residuals, Jacobians and sums of the normal equations at the first state."""
     inputs = inputs_for(rig, [measurements])
     state = initial_state(inputs, initial_guess(rig, measurements))
-    problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, measurements))
+    problem = assemble(inputs, state, MODEL.first_noise(rig.cameras, rig, measurements))
     pieces, out = problem.pieces(), problem.residuals()
     seconds = median_time(lambda: problem.linearise(state, pieces, out), 9)
     corners = sum(len(s.uv) for s in measurements.cameras)

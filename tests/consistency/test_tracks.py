@@ -53,7 +53,7 @@ def test_noiseless_tracks_are_recovered_from_nothing_but_rough_intrinsics():
     state = initial_state(inputs, *initial_guesses(rig, inputs.bodies, [m.measurements for m in inputs.motions]))
     state = replace(state, bias=np.zeros_like(state.bias))  # the prior on the first biases then pulls nothing
     streams = inputs.measurements.cameras
-    noise = MODEL.first_noises(rig.cameras, rig, inputs.measurements)
+    noise = MODEL.first_noise(rig.cameras, rig, inputs.measurements)
     last = None
     for _ in range(3):
         problem = assemble(inputs, state, noise, coarse=True)

@@ -112,7 +112,7 @@ def problem(rig, recordings, request):
     if real:
         state.values["board0", "shape"][:] = 1e-3
     models = [NoiseModel(0.2, tau=0.1 if real else 0.0) for _ in rig.cameras]
-    streams, noise = inputs.measurements.cameras, MODEL.first_noises(rig.cameras, rig, inputs.measurements)
+    streams, noise = inputs.measurements.cameras, MODEL.first_noise(rig.cameras, rig, inputs.measurements)
     for c, m, s in zip(rig.cameras, models, streams, strict=True):
         noise[c.name] = dataclasses.replace(noise[c.name], corners=m.noise(s, settings))
     return assemble(inputs, state, noise), state

@@ -17,7 +17,6 @@ import icalib
 from icalib.base.yaml_nodes import parse_yaml
 from icalib.estimate.inputs import specs_of, tolerance_of
 from icalib.geometry.targets import Checkerboard
-from icalib.model.sensor_model import own_entries
 from icalib.optim.state import make_layout
 from icalib.rig import (
     Camera,
@@ -100,7 +99,7 @@ def test_every_parameter_has_its_labels_and_a_tolerance(sensor: Sensor):
     for spec in sensor.specs():
         assert len(set(spec.labels)) == spec.size and spec.prior_sigma > 0.0
         assert (spec.labels == (spec.name,)) == (spec.size == 1)
-    layout = make_layout(own_entries(sensor))
+    layout = make_layout([spec.entry(sensor.name, True) for spec in sensor.specs()])
     assert [b.name for b in layout.blocks] == [spec.name for spec in sensor.specs()]
     assert (tolerance_of(layout, specs_of(layout, [sensor]), Settings()) > 0.0).all()
 
@@ -139,7 +138,7 @@ def test_a_definition_is_all_that_a_new_parameter_needs():
     found = value.record((), parameter_fields(Bent))
     sensor = Bent("lidar0", "", **parameters(found, Bent.stated()))
     assert groups_to_plain(sensor)["bend"] == {"guess": [0.1, 0.2]}
-    layout = make_layout(own_entries(sensor))
+    layout = make_layout([spec.entry(sensor.name, True) for spec in sensor.specs()])
     specs = specs_of(layout, [sensor])
     block, spec = layout.block("lidar0", "bend"), specs["lidar0", "bend"]
     assert (block.kind, block.size, spec.display_unit[0], spec.labels) == ("vector", 2, "deg", ("left", "up"))

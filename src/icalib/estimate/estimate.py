@@ -43,7 +43,7 @@ class MeasurementModel:
         """Model before any pass: noise as the rig file states it, else usual values."""
         noise = {}
         for model, sensors in by_kind(inputs.rig.mounted):
-            noise |= model.first_noises(sensors, inputs.rig, inputs.measurements)
+            noise |= model.first_noise(sensors, inputs.rig, inputs.measurements)
         return cls(noise, True)
 
     def problem(self, inputs: Inputs, state: State, fixed_directions: np.ndarray = NO_DIRECTIONS) -> Problem:
@@ -59,7 +59,7 @@ class MeasurementModel:
         )  # fmt: skip
         noise = {}
         for model, sensors in by_kind(inputs.rig.mounted):
-            noise |= model.next_noises(sensors, self.noise, end)
+            noise |= model.next_noise(sensors, self.noise, end)
         return MeasurementModel(noise)
 
 

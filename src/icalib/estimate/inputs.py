@@ -13,7 +13,7 @@ from icalib.data.measurements import Measurements, Part, Stream, join
 from icalib.geometry.targets.base import BOARD
 from icalib.kinds import models
 from icalib.model.bodies import Bodies
-from icalib.model.sensor_model import clocks_of, model_of
+from icalib.model.sensor_model import clocks_of, model_of, own_entries
 from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.point_planes import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
@@ -49,7 +49,7 @@ class Inputs:
     @cached_property
     def owners(self) -> dict[str, Sensor]:
         """All sensors that have parameters and factors, by name, the IMU first."""
-        return {s.name: s for s in self.rig.sensors.values() if model_of(s).takes_part(s, self.association)}
+        return {s.name: s for s in self.rig.sensors.values() if _takes_part(s, self.association)}
 
     @cached_property
     def specs(self) -> dict[Key, ParameterSpec]:
@@ -95,9 +95,11 @@ class Inputs:
 def inputs_for(rig: Rig, recordings: Sequence[Measurements], whole: Inputs | None = None) -> Inputs:
     """Inputs of one or several recordings, joined. whole: inputs whose clock shifts are used, if `recordings` are some
     of their streams."""
-    bodies = next(b for model in models().values() if (b := model.target_bodies(rig, recordings)) is not None)
+    bodies = None
     for model in models().values():
-        recordings = [model.prepared(rig, bodies, r) for r in recordings]
+        recordings, connected = model.prepared(rig, recordings)
+        bodies = connected if bodies is None else bodies
+    assert bodies is not None
     shifts = None if whole is None else [part.shift_ns for part in whole.parts]
     joined, parts = join(rig, recordings, shifts)
     layout = layout_for(rig, bodies, len(parts))
@@ -118,7 +120,7 @@ def layout_for(
     imu, sensors = rig.imu, _taking_part(rig, association)
     entries: list[Entry] = []
     if imu is not None:
-        entries += model_of(imu).entries(imu, rig, n_recordings)
+        entries += own_entries(imu, rig, n_recordings)
         entries += [GRAVITY.entry(WORLD)] if rig.gravity_sigma > 0.0 else []
     # Without an IMU the frame of the target is the world frame of all recordings.
     levelled = imu is not None and not rig.assumes_motion
@@ -126,7 +128,7 @@ def layout_for(
         entries.append(TILT.entry(in_recording(BOARD, k), levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
     for sensor in sensors:
-        entries += model_of(sensor).entries(sensor, rig, n_recordings)
+        entries += own_entries(sensor, rig, n_recordings)
     for sensor in sensors:
         entries += model_of(sensor).scene_entries(sensor, rig, n_recordings)
     return make_layout(entries + bodies.pose_entries() + association.entries)
@@ -134,7 +136,12 @@ def layout_for(
 
 def _taking_part(rig: Rig, association: PlaneAssociation) -> tuple[Sensor, ...]:
     """Mounted sensors that have parameters and factors."""
-    return tuple(s for s in rig.mounted if model_of(s).takes_part(s, association))
+    return tuple(s for s in rig.mounted if _takes_part(s, association))
+
+
+def _takes_part(sensor: Sensor, association: PlaneAssociation) -> bool:
+    """Whether the sensor has parameters and factors: one that shows planes only once these are known."""
+    return association.count > 0 or not sensor.shows_planes
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:

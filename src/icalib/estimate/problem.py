@@ -13,7 +13,7 @@ import numpy as np
 from icalib.errors import EstimationError
 from icalib.estimate.inputs import UNGUESSED_TRANSLATION_SIGMA_M, Inputs, origin_difference
 from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
-from icalib.model.sensor_model import Pass, SensorModel, by_kind, model_of
+from icalib.model.sensor_model import Pass, by_kind, model_of
 from icalib.motion.factor import Factor, FactorKey, IndependentKeyframes, Residuals, Whitened, keyed
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import (
@@ -37,7 +37,7 @@ from icalib.optim.arrowhead import (
     marginalise_in_segments,
 )
 from icalib.optim.state import Block, Key, Layout, State
-from icalib.rig import Parameter, Rig, Sensor
+from icalib.rig import Parameter, Rig
 from icalib.rig.scene import FRAME as SENSOR_FRAME
 from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, WORLD
 from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION
@@ -285,24 +285,15 @@ def _given(block: Block, parameter: Parameter, shift: float = 0.0) -> list[Prior
     return [Prior(block, value, sigma)]
 
 
-def keyframe_times(inputs: Inputs, values: dict[Key, np.ndarray]) -> list[np.ndarray]:
-    """Times at which keyframes are wanted, one array per sensor [s, body's clock since its first stamp]."""
-    return [
-        model.keyframe_times(sensor, inputs.stream(sensor.name), values, inputs.rig)
-        for model, sensors in _keyframe_sources(inputs.rig)
-        for sensor in sensors
-    ]
-
-
-def _keyframe_sources(rig: Rig) -> list[tuple[SensorModel, list[Sensor]]]:
-    """Models and sensors that place keyframes: the first kind that can. If the rig assumes its motion and poses measure
-    it, all kinds that can."""
-    sources = [
-        (model, placing)
-        for model, sensors in by_kind(rig.sensors.values())
-        if model.keyframes and (placing := list(model.placing_keyframes(sensors, rig)))
-    ]
-    return sources if rig.assumes_motion and rig.moves_by_poses else sources[:1]
+def keyframe_times(inputs: Inputs, values: Mapping[Key, np.ndarray]) -> dict[str, np.ndarray]:
+    """Times at which keyframes are wanted, by sensor [s, body's clock since its first stamp]: those of the first kind
+    that places any. If the rig assumes its motion and poses measure it, those of all kinds."""
+    rig, times = inputs.rig, dict[str, np.ndarray]()
+    every_kind = rig.assumes_motion and rig.moves_by_poses
+    for model, sensors in by_kind(rig.mounted):
+        if every_kind or not times:
+            times |= model.keyframe_times(sensors, rig, inputs.measurements.streams, values)
+    return times
 
 
 def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
@@ -318,27 +309,28 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     )
 
 
-def keyframes_for(inputs: Inputs, times: list[np.ndarray]) -> np.ndarray:
+def keyframes_for(inputs: Inputs, times: Mapping[str, np.ndarray]) -> np.ndarray:
     """Keyframe times [s] for images or scans at `times`, one array per sensor. Raises EstimationError if clocks do not
     overlap."""
-    settings = inputs.rig.settings
+    settings, every = inputs.rig.settings, list(times.values())
     if inputs.imu is None:
-        return distinct(np.sort(np.concatenate(times)))
-    hosts = times[:1] if settings.keyframes == "first-camera" else times
+        return distinct(np.sort(np.concatenate(every)))
+    hosts = every[:1] if settings.keyframes == "first-camera" else every
     keyframes = place_keyframes(inputs.imu, hosts, settings.keyframe_spacing_s, settings.max_gap_s)
     counts = np.diff((*first_keyframes(inputs.imu, keyframes), len(keyframes)))
     if counts.min() < 3:
         where = f"{inputs.parts[int(np.argmin(counts))].name}: " if len(inputs.parts) > 1 else ""
         raise EstimationError(
-            f"{where}fewer than 3 {_hosts(inputs.rig)} fall within the recording of {inputs.imu.name}; check that the "
-            "clocks overlap, or the time_offset in the rig file."
+            f"{where}fewer than 3 {_hosts(inputs.rig, list(times))} fall within the recording of {inputs.imu.name}; "
+            "check that the clocks overlap, or the time_offset in the rig file."
         )
     return keyframes
 
 
-def _hosts(rig: Rig) -> str:
-    model, sensors = _keyframe_sources(rig)[0]
-    return f"{model.keyframes} of {', '.join(s.name for s in sensors)}"
+def _hosts(rig: Rig, names: Sequence[str]) -> str:
+    """The measurements of the first kind among the sensors `names`, as text."""
+    first = rig.sensors[names[0]]
+    return f"{first.readings} of {', '.join(n for n in names if rig.sensors[n].sensor_type == first.sensor_type)}"
 
 
 def assemble(
@@ -378,7 +370,7 @@ def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor
             sensor_factors: list[Factor] = []
             for s in sensors:
                 measured = s, inputs.stream(s.name), noise[s.name], at
-                sensor_factors += model.still_factors(*measured) if at.motion is None else model.factors(*measured)
+                sensor_factors += model.factors(*measured)
             factors_by_kind.append(
                 (sensor_factors, aside.submit(model.joint_factors, sensors, sensor_factors, noise, at))
             )
@@ -415,9 +407,9 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
         values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
     for sensor in rig.sensors.values():
         for spec in sensor.specs():
-            value = model_of(sensor).start_value(sensor, spec, rig)
-            if value is not None:
-                values[sensor.name, spec.name] = value
+            if spec.manifold == "nuisance" or spec.is_auxiliary:  # the guess has no bias, scale or shape
+                stated = getattr(sensor, spec.name).value
+                values[sensor.name, spec.name] = np.zeros(spec.size) if stated is None else stated.copy()
     for sensor in rig.mounted:
         if (offset := values.get((sensor.name, TIME_OFFSET.name))) is not None:
             values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(offset, inputs.clocks_of(sensor))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Generic, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, Generic, Protocol, Self, TypeVar, runtime_checkable
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import EstimatedMotion, instants
 from icalib.optim.state import Entry, Key, Layout, State, in_recording
-from icalib.rig import ParameterSpec, Rig, Sensor, Settings, scene
+from icalib.rig import ParameterSpec, Rig, Sensor, scene
 from icalib.sensors.sensor import TIME_OFFSET
 
 S = TypeVar("S", bound=Sensor)
@@ -66,102 +66,55 @@ class Clusters:
 
 class SensorModel(Generic[S, N]):
     """Interface of the sensors S of one kind for the estimator, with noise of the class N. The defaults fit a sensor
-    with a pose and a clock but no factor.
-
-    keyframes: measurements at which keyframes are placed, as in "images of cam0"; empty if the kind places none.
-    """
-
-    keyframes: ClassVar[str] = ""
+    with a pose and a clock but no factor."""
 
     # Measurements
 
-    def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies | None:
-        """Bodies of the target that measurements of this kind connect; None for kinds that see no target."""
-        return None
-
-    def prepared(self, rig: Rig, bodies: Bodies, recording: Measurements) -> Measurements:
-        """The recording with its streams of this kind as factors need them: with `bodies` of the target alone."""
-        return recording
+    def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[Sequence[Measurements], Bodies | None]:
+        """The recordings with their streams of this kind as factors need them, and the bodies of the target that these
+        connect; None for kinds that see no target."""
+        return recordings, None
 
     # Parameters
-
-    def takes_part(self, sensor: S, association: PlaneAssociation) -> bool:
-        """Whether the sensor has parameters and factors. association: LiDAR points on planes."""
-        return True
 
     def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
         """Whether a parameter group of the sensor is estimated."""
         return sensor.is_estimated(spec)
-
-    def entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
-        """Layout entries of the sensor's parameter groups."""
-        return own_entries(sensor, n_recordings, lambda spec: self.is_estimated(sensor, spec, rig))
 
     def scene_entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
         """Layout entries of quantities of the scene that this sensor needs, such as the reference frame of its
         poses."""
         return []
 
-    def start_value(self, sensor: S, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
-        """Start value (spec.size,) of a nuisance or auxiliary group (bias, scale, shape): the value of the rig file, or
-        zero. None for groups that the initial guess determines."""
-        if not (spec.manifold == "nuisance" or spec.is_auxiliary):
-            return None
-        stated = getattr(sensor, spec.name).value
-        return np.zeros(spec.size) if stated is None else stated.copy()
-
-    def placing_keyframes(self, sensors: Sequence[S], rig: Rig) -> Sequence[S]:
-        """Those of `sensors` that place keyframes, of a kind with `keyframes`; by default all."""
-        return sensors
-
-    def keyframe_times(self, sensor: S, stream: Any, values: dict[Key, np.ndarray], rig: Rig) -> np.ndarray:
-        """(n,) times at which the sensor needs keyframes [s, body's clock since its first stamp]."""
-        return instants(stream, values)
+    def keyframe_times(
+        self, sensors: Sequence[S], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """By sensor: (n,) times at which keyframes are wanted [s, body's clock since its first stamp]; empty if the
+        kind places none."""
+        return {s.name: instants(streams[s.name], values) for s in sensors}
 
     def widen_guess_sigma(self, sensor: S, layout: Layout, state: State, sigma: np.ndarray) -> None:
         """Enlarges standard deviations (B,) of the initial guess where errors of other parameters of the sensor add to
         them, to first order at `state`."""
 
-    # Noise
+    # Noise and inliers of all sensors of the kind
 
-    def first_noise(self, sensor: S, settings: Settings) -> N:
-        """Noise before any residuals are known: stated, or usual values."""
+    def first_noise(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> dict[str, N]:
+        """Noise of each sensor before any residuals are known: stated, or usual values."""
         raise NotImplementedError
 
-    def next_noise(self, sensor: S, noise: N, statistics: ResidualStatistics) -> N:
-        """Noise estimated from the residual statistics of a pass with `noise`. Stated parts are unchanged."""
-        return noise
-
-    def noise_passes(self, sensor: S) -> int:
-        """Number of passes that the noise estimate needs; 0 if all noise is stated."""
-        return 0
-
-    def noise_is_estimated(self, sensor: S) -> bool:
-        """Whether some of the noise is estimated from residuals."""
-        return self.noise_passes(sensor) > 0
-
-    # Noise and inliers of all sensors of the kind; overridden by kinds whose sensors share measurements
-
-    def first_noises(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> dict[str, N]:
-        """`first_noise` of each sensor."""
-        return {s.name: self.first_noise(s, rig.settings) for s in sensors}
-
-    def next_noises(self, sensors: Sequence[S], noise: Mapping[str, N], end: PassEnd) -> dict[str, N]:
-        """`next_noise` of each sensor, after a pass with `noise`."""
-        return {s.name: self.next_noise(s, noise[s.name], end.of(s.name)) for s in sensors}
+    def next_noise(self, sensors: Sequence[S], noise: Mapping[str, N], end: PassEnd) -> dict[str, N]:
+        """Noise of each sensor, estimated after a pass with `noise`. Stated parts are unchanged."""
+        return {s.name: noise[s.name] for s in sensors}
 
     def passes(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> int:
-        """Number of passes that the estimates of noise and inliers need."""
-        return max((self.noise_passes(s) for s in sensors), default=0)
+        """Number of passes that the estimates of noise and inliers need; 0 if all noise is stated."""
+        return 0
 
     # Factors
 
     def factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """Factors of the sensor in a rig with an IMU, whose motion is `at.motion`."""
-        return ()
-
-    def still_factors(self, sensor: S, stream: Any, noise: N, at: Pass) -> Iterable[Factor]:
-        """Factors of the sensor in a rig without an IMU. Measurements are at keyframes, and keyframes are
+        """Factors of the sensor. Without an IMU `at.motion` is None; then measurements are at keyframes, which are
         independent."""
         return ()
 
@@ -203,14 +156,11 @@ def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], 
             yield model, sensors_of_kind
 
 
-def own_entries(
-    sensor: Sensor, n_recordings: int = 1, is_estimated: Callable[[ParameterSpec], bool] | None = None
-) -> list[Entry]:
+def own_entries(sensor: Sensor, rig: Rig, n_recordings: int) -> list[Entry]:
     """Layout entries of a sensor's parameters. A clock that restarts has a time offset in each recording."""
-    n_clocks = clocks_of(sensor, n_recordings)
+    model, n_clocks = model_of(sensor), clocks_of(sensor, n_recordings)
     specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
-    free = is_estimated or sensor.is_estimated
-    return [spec.entry(sensor.name, free(spec)) for spec in specs]
+    return [spec.entry(sensor.name, model.is_estimated(sensor, spec, rig)) for spec in specs]
 
 
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:

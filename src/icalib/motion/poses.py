@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -427,7 +427,7 @@ def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
 RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; recordings are further apart
 
 
-def instants(stream: Stream, values: dict[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
+def instants(stream: Stream, values: Mapping[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
     """Times (n,) on the clock of the body. seconds (n,): times since the first stamp of the stream, by default those of
     its stamps."""
     t, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]

@@ -45,7 +45,7 @@ def solved() -> tuple[Problem, Outcome]:
     scenario = replace(followers(3.0), **exact)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
-    problem = assemble(inputs, state, MODEL.first_noises(rig.cameras, rig, inputs.measurements))
+    problem = assemble(inputs, state, MODEL.first_noise(rig.cameras, rig, inputs.measurements))
     return problem, minimise(problem, state, SolverOptions(1e-6))
 
 

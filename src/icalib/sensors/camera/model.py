@@ -68,15 +68,10 @@ class CameraNoise:
 class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     """Sensor model of cameras. Without an IMU, images with equal stamps are simultaneous."""
 
-    keyframes = "images"
-
-    def target_bodies(self, rig: Rig, recordings: Sequence[Measurements]) -> Bodies:
-        """See `SensorModel`, and `choose_bodies`."""
-        return choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
-
-    def prepared(self, rig: Rig, bodies: Bodies, recording: Measurements) -> Measurements:
-        """See `SensorModel`; corners and tracks of a camera get the same images."""
-        return on_common_images(rig, restrict(bodies, recording))
+    def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[Measurements], Bodies]:
+        """See `SensorModel` and `choose_bodies`; corners and tracks of a camera get the same images."""
+        bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
+        return [on_common_images(rig, restrict(bodies, recording)) for recording in recordings], bodies
 
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
         """See `SensorModel`. Bloom is estimated only if the target has edges that it shifts.
@@ -86,19 +81,13 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
             return False
         return sensor.is_estimated(spec) and (spec != BLOOM or rig.blooms)
 
-    def start_value(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> np.ndarray | None:
-        """See `SensorModel`. Bloom that is not modelled is zero."""
-        if spec == BLOOM and not rig.blooms:
-            return np.zeros(BLOOM.size)
-        return super().start_value(sensor, spec, rig)
-
     def widen_guess_sigma(self, sensor: Camera, layout: Layout, state: State, sigma: np.ndarray) -> None:
         """See `SensorModel`: errors of distortion coefficients add to those of fx and fy."""
         columns = layout.columns(sensor.name, *LENS)
         if (columns >= 0).all():
             sigma[columns[:2]] = np.hypot(sigma[columns[:2]], _focal_sigma(sensor, state, sigma[columns[4:]]))
 
-    def first_noises(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> dict[str, CameraNoise]:
+    def first_noise(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> dict[str, CameraNoise]:
         """For each camera the noise of the rig file or a default, with all corners and track observations in use."""
         noise, tracks = {}, {t.name: t for t in measurements.tracks}
         for camera, stream in zip(sensors, measurements.cameras, strict=True):
@@ -108,7 +97,7 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
             noise[camera.name] = CameraNoise(model, model.noise(stream, rig.settings), keep, late, selection)
         return noise
 
-    def next_noises(
+    def next_noise(
         self, sensors: Sequence[Camera], noise: Mapping[str, CameraNoise], end: PassEnd
     ) -> dict[str, CameraNoise]:
         """For each camera the noise of the next pass.
@@ -138,12 +127,6 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
 
     def factors(self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass) -> Iterator[CornerFactor]:
         """Yields the corner factor of the camera, which may have no corners."""
-        yield corner_factor(sensor, stream, noise, at)
-
-    def still_factors(
-        self, sensor: Camera, stream: CornerStream, noise: CameraNoise, at: Pass
-    ) -> Iterator[CornerFactor]:
-        """Yields the corner factor of the camera, as `factors` does."""
         yield corner_factor(sensor, stream, noise, at)
 
     def joint_factors(

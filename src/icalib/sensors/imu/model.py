@@ -8,17 +8,13 @@ import numpy as np
 
 from icalib.data.measurements import ImuStream
 from icalib.model.sensor_model import Pass, SensorModel
-from icalib.rig import ImuNoise, ImuSensor, Settings
+from icalib.rig import ImuNoise, ImuSensor
 from icalib.rig.scene import GRAVITY, WORLD
 from icalib.sensors.imu.residual import ImuFactor
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
     """Sensor model of the IMU. Being the reference of poses and time, it has no extrinsics and no time offset."""
-
-    def first_noise(self, sensor: ImuSensor, settings: Settings) -> ImuNoise:
-        """See `SensorModel`; the noise in the rig file."""
-        return sensor.noise
 
     def factors(self, sensor: ImuSensor, stream: ImuStream, noise: ImuNoise, at: Pass) -> Iterator[ImuFactor]:
         """Yields the factor of all intervals between keyframes. The readings of `at` already contain the noise."""

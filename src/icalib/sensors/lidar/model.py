@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from icalib.data.measurements import LidarStream
-from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel
-from icalib.motion.point_planes import PlaneAssociation, thinned
-from icalib.rig import Lidar, Settings
+from icalib.data.measurements import LidarStream, Measurements
+from icalib.model.sensor_model import Pass, PassEnd, SensorModel
+from icalib.motion.point_planes import thinned
+from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.residual import LidarFactor
 
@@ -23,27 +24,30 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     """Sensor model of a LiDAR, used once planes are known. Stated noise is along the beam; estimated noise is
     isotropic."""
 
-    keyframes = "scans"
+    def first_noise(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> dict[str, LidarNoise]:
+        loss, scale = rig.settings.loss, rig.settings.loss_scale
+        stated = {s.name: s.range_noise_m for s in sensors}
+        return {
+            name: LidarNoise(FIRST_RANGE_SIGMA_M, 0.0, loss, scale)
+            if noise is None
+            else LidarNoise(GRAZING_SIGMA_M, noise, loss, scale)
+            for name, noise in stated.items()
+        }
 
-    def takes_part(self, sensor: Lidar, association: PlaneAssociation) -> bool:
-        return association.count > 0
-
-    def first_noise(self, sensor: Lidar, settings: Settings) -> LidarNoise:
-        loss, scale = settings.loss, settings.loss_scale
-        if sensor.range_noise_m is None:
-            return LidarNoise(FIRST_RANGE_SIGMA_M, 0.0, loss, scale)
-        return LidarNoise(GRAZING_SIGMA_M, sensor.range_noise_m, loss, scale)
-
-    def next_noise(self, sensor: Lidar, noise: LidarNoise, statistics: ResidualStatistics) -> LidarNoise:
+    def next_noise(
+        self, sensors: Sequence[Lidar], noise: Mapping[str, LidarNoise], end: PassEnd
+    ) -> dict[str, LidarNoise]:
         """The noise scaled by the RMS of the whitened distances, unless the rig file states it."""
-        points = statistics.squares.get("points")
-        if sensor.range_noise_m is not None or points is None:
-            return noise
-        sigma = max(noise.sigma * float(np.sqrt(points.chi2 / points.n)), MIN_RANGE_SIGMA_M)
-        return LidarNoise(sigma, 0.0, noise.loss, noise.loss_scale)
+        next_noise = {s.name: noise[s.name] for s in sensors}
+        for sensor in sensors:
+            points = end.of(sensor.name).squares.get("points") if sensor.range_noise_m is None else None
+            if points is not None:
+                sigma = noise[sensor.name].sigma * float(np.sqrt(points.chi2 / points.n))
+                next_noise[sensor.name] = replace(noise[sensor.name], sigma=max(sigma, MIN_RANGE_SIGMA_M))
+        return next_noise
 
-    def noise_passes(self, sensor: Lidar) -> int:
-        return int(sensor.range_noise_m is None)
+    def passes(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> int:
+        return int(any(s.range_noise_m is None for s in sensors))
 
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
         """One factor for all points on planes. Coarse passes use fewer points and longer bins."""

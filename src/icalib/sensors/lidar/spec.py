@@ -33,6 +33,7 @@ class Lidar(MountedSensor):
 
     sensor_type: ClassVar[str] = "lidar"
     noun: ClassVar[str] = "LiDAR"
+    readings: ClassVar[str] = "scans"
     gives_motion: ClassVar[bool] = True
     needs_imu: ClassVar[str] = (
         "or run LiDAR odometry, and give its nav_msgs/Odometry as a sensor of type: pose, kind: relative"

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from icalib.data.measurements import PoseStream
-from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel, frame_entries
+from icalib.data.measurements import Measurements, PoseStream
+from icalib.model.sensor_model import Pass, PassEnd, SensorModel, frame_entries
 from icalib.motion.poses import instants, spaced
 from icalib.optim.state import Entry, Key
-from icalib.rig import ImuSensor, PoseSensor, Rig, Settings
+from icalib.rig import ImuSensor, PoseSensor, Rig
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseFactor, PoseNoise, RelativePosesFactor
 
 # Noise in the first pass if the rig file states none, then it is estimated. Absolute poses: rad, m; relative poses:
@@ -24,8 +25,6 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     no other sensor determines the trajectory, it absorbs most residuals. The first noise estimate is rough, so that
     there is a second."""
 
-    keyframes = "poses"
-
     def scene_entries(self, sensor: PoseSensor, rig: Rig, n_recordings: int) -> list[Entry]:
         """Parameters of the frame of absolute poses in each recording. The frame is fixed as the world frame if this
         sensor alone gives the motion."""
@@ -35,41 +34,45 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         is_world = is_reference and (rig.imu is None or rig.assumes_motion)
         return frame_entries(sensor.name, n_recordings, not is_world)
 
-    def placing_keyframes(self, sensors: Sequence[PoseSensor], rig: Rig) -> Sequence[PoseSensor]:
-        """Only the first sensor, see `SensorModel`."""
-        return sensors[:1]
-
     def keyframe_times(
-        self, sensor: PoseSensor, stream: PoseStream, values: dict[Key, np.ndarray], rig: Rig
-    ) -> np.ndarray:
-        """Times of poses at about the keyframe spacing, in seconds on the IMU's clock."""
-        imu = rig.imu or ImuSensor  # the default spacing without an IMU
-        return instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))
+        self, sensors: Sequence[PoseSensor], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Times of poses of the first sensor, at about the keyframe spacing."""
+        imu, stream = rig.imu or ImuSensor, streams[sensors[0].name]  # the default spacing without an IMU
+        return {sensors[0].name: instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))}
 
-    def first_noise(self, sensor: PoseSensor, settings: Settings) -> PoseNoise:
-        rotation = FIRST_ROTATION_NOISE if sensor.rotation_noise is None else sensor.rotation_noise
-        position = FIRST_POSITION_NOISE if sensor.position_noise is None else sensor.position_noise
-        return PoseNoise(rotation, position, settings.loss, settings.loss_scale)
+    def first_noise(self, sensors: Sequence[PoseSensor], rig: Rig, measurements: Measurements) -> dict[str, PoseNoise]:
+        return {
+            s.name: PoseNoise(
+                FIRST_ROTATION_NOISE if s.rotation_noise is None else s.rotation_noise,
+                FIRST_POSITION_NOISE if s.position_noise is None else s.position_noise,
+                rig.settings.loss,
+                rig.settings.loss_scale,
+            )
+            for s in sensors
+        }
 
-    def next_noise(self, sensor: PoseSensor, noise: PoseNoise, statistics: ResidualStatistics) -> PoseNoise:
-        if not self.noise_is_estimated(sensor):
-            return noise
-        return estimated_noise(sensor, noise, statistics.variance_factors())
+    def next_noise(
+        self, sensors: Sequence[PoseSensor], noise: Mapping[str, PoseNoise], end: PassEnd
+    ) -> dict[str, PoseNoise]:
+        factors = {s.name: end.of(s.name).variance_factors() if is_estimated(s) else {} for s in sensors}
+        return {s.name: estimated_noise(s, noise[s.name], factors[s.name]) for s in sensors}
 
-    def noise_passes(self, sensor: PoseSensor) -> int:
-        return 2 if sensor.rotation_noise is None or sensor.position_noise is None else 0
+    def passes(self, sensors: Sequence[PoseSensor], rig: Rig, measurements: Measurements) -> int:
+        return 2 * any(is_estimated(s) for s in sensors)
 
     def factors(self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass) -> Iterator[PoseFactor]:
         """One factor, of absolute or relative poses according to the sensor's kind."""
-        assert at.motion is not None
+        if at.motion is None:
+            yield AbsolutePoseFactor.at_keyframes(stream, at.state, at.starts, noise, at.layout)
+            return
         kind = AbsolutePoseFactor if sensor.kind == "absolute" else RelativePosesFactor
         yield kind.build(stream, at.motion, noise, at.layout)
 
-    def still_factors(
-        self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass
-    ) -> Iterator[AbsolutePoseFactor]:
-        """One factor of the poses that were taken at keyframes, without an IMU."""
-        yield AbsolutePoseFactor.at_keyframes(stream, at.state, at.starts, noise, at.layout)
+
+def is_estimated(sensor: PoseSensor) -> bool:
+    """Whether some noise is estimated from residuals."""
+    return sensor.rotation_noise is None or sensor.position_noise is None
 
 
 def estimated_noise(sensor: PoseSensor, noise: PoseNoise, variance_factors: dict[str, float]) -> PoseNoise:

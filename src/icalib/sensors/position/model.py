@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from icalib.model.sensor_model import Pass, ResidualStatistics, SensorModel, frame_entries
-from icalib.optim.state import Entry
-from icalib.rig import Rig, Settings
+from icalib.data.measurements import Measurements
+from icalib.model.sensor_model import Pass, PassEnd, SensorModel, frame_entries
+from icalib.optim.state import Entry, Key
+from icalib.rig import Rig
 from icalib.rig.scene import FRAME, LEVEL_FRAME
 from icalib.sensors.position.frame import frame_owner
 from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
@@ -22,10 +24,8 @@ LEAST_NOISE = 1e-6
 
 
 class PositionModel(SensorModel[PositionSensor, PositionNoise]):
-    """See `SensorModel`. Noise that is not stated is estimated as chi^2 over degrees of freedom, separately for
+    """Noise that is not stated is estimated as chi^2 over degrees of freedom, separately for
     horizontal and vertical residuals. The trajectory absorbs some of the noise, so that two passes estimate it."""
-
-    keyframes = "positions"
 
     def scene_entries(self, sensor: PositionSensor, rig: Rig, n_recordings: int) -> list[Entry]:
         """Entries of the sensor's frame in each recording, unless it shares a frame; then the knots of the slow offset.
@@ -36,29 +36,36 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
         levelled = rig.imu is not None and not rig.assumes_motion and sensor.frame == LEVELLED
         return frame_entries(sensor.name, n_recordings, specs=LEVEL_FRAME if levelled else FRAME) + knots
 
-    def placing_keyframes(self, sensors: Sequence[PositionSensor], rig: Rig) -> Sequence[PositionSensor]:
+    def keyframe_times(
+        self, sensors: Sequence[PositionSensor], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
+    ) -> dict[str, np.ndarray]:
         """None if the motion is assumed to be smooth: other sensors then place keyframes densely enough."""
-        return () if rig.assumes_motion else sensors
+        return {} if rig.assumes_motion else super().keyframe_times(sensors, rig, streams, values)
 
-    def first_noise(self, sensor: PositionSensor, settings: Settings) -> PositionNoise:
+    def first_noise(
+        self, sensors: Sequence[PositionSensor], rig: Rig, measurements: Measurements
+    ) -> dict[str, PositionNoise]:
         """The stated noise [m] if the rig file has a number; else 1, a factor on the standard deviations of
         `weighted`."""
-        size = sensor.position_noise
-        first = 1.0 if size == "messages" or size is None else size
-        return PositionNoise(first, first, settings.loss, settings.loss_scale)
+        sizes = {s.name: s.position_noise if isinstance(s.position_noise, float) else 1.0 for s in sensors}
+        loss, scale = rig.settings.loss, rig.settings.loss_scale
+        return {name: PositionNoise(size, size, loss, scale) for name, size in sizes.items()}
 
-    def next_noise(self, sensor: PositionSensor, noise: PositionNoise, statistics: ResidualStatistics) -> PositionNoise:
-        if not self.noise_is_estimated(sensor):
-            return noise
-        factors = statistics.variance_factors()
-        horizontal, vertical = (
-            max(size * float(np.sqrt(factors.get(kind, 1.0))), LEAST_NOISE)
-            for kind, size in (("horizontal", noise.horizontal), ("vertical", noise.vertical))
-        )
-        return replace(noise, horizontal=horizontal, vertical=vertical)
+    def next_noise(
+        self, sensors: Sequence[PositionSensor], noise: Mapping[str, PositionNoise], end: PassEnd
+    ) -> dict[str, PositionNoise]:
+        next_noise = {s.name: noise[s.name] for s in sensors}
+        for name in (s.name for s in sensors if s.position_noise is None):
+            factors, now = end.of(name).variance_factors(), noise[name]
+            horizontal, vertical = (
+                max(size * float(np.sqrt(factors.get(kind, 1.0))), LEAST_NOISE)
+                for kind, size in (("horizontal", now.horizontal), ("vertical", now.vertical))
+            )
+            next_noise[name] = replace(now, horizontal=horizontal, vertical=vertical)
+        return next_noise
 
-    def noise_passes(self, sensor: PositionSensor) -> int:
-        return 2 if sensor.position_noise is None else 0
+    def passes(self, sensors: Sequence[PositionSensor], rig: Rig, measurements: Measurements) -> int:
+        return 2 * any(s.position_noise is None for s in sensors)
 
     def factors(
         self, sensor: PositionSensor, stream: PositionStream, noise: PositionNoise, at: Pass

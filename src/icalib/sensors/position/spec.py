@@ -55,6 +55,7 @@ class PositionSensor(ClockedSensor):
     sensor_type: ClassVar[str] = "position"
     noun: ClassVar[str] = "position sensor"
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET)
+    readings: ClassVar[str] = "positions"
     gives_motion: ClassVar[bool] = True
 
     path: str

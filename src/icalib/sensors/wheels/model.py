@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.data.measurements import Measurements, WheelPoses, WheelStream
 from icalib.model.sensor_model import Pass, SensorModel
 from icalib.motion.factor import Factor
 from icalib.motion.poses import EstimatedMotion, instants, spaced
 from icalib.optim.state import Key, Layout
-from icalib.rig import Rig, Settings, Wheels
+from icalib.rig import Rig, Wheels
 from icalib.sensors.wheels.ground_factor import GroundFactor, floors
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelFactor, WheelNoise, integrals_of
 
@@ -19,24 +20,25 @@ from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, 
 class WheelModel(SensorModel[Wheels, WheelNoise]):
     """Sensor model of wheels; their noise is stated in the rig file."""
 
-    keyframes = "readings"
-
-    def placing_keyframes(self, sensors: Sequence[Wheels], rig: Rig) -> Sequence[Wheels]:
-        """The wheels whose frame is the body, if the motion is assumed to be smooth."""
-        return [s for s in sensors if rig.assumes_motion and s.name == rig.reference_without_imu]
-
     def keyframe_times(
-        self, sensor: Wheels, stream: WheelStream | WheelPoses, values: dict[Key, np.ndarray], rig: Rig
-    ) -> np.ndarray:
-        """Times of readings at about the keyframe spacing, see `SensorModel`."""
-        assert rig.imu is not None
-        return instants(stream, values, spaced(stream.seconds, rig.imu.pose_keyframes_s))
+        self, sensors: Sequence[Wheels], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Times of readings at about the keyframe spacing, of the wheels whose frame is the body, if the motion is
+        assumed to be smooth."""
+        if rig.imu is None or not rig.assumes_motion:
+            return {}
+        placing = [streams[s.name] for s in sensors if s.name == rig.reference_without_imu]
+        return {s.name: instants(s, values, spaced(s.seconds, rig.imu.pose_keyframes_s)) for s in placing}
 
-    def first_noise(self, sensor: Wheels, settings: Settings) -> WheelNoise:
-        return WheelNoise(
-            sensor.wheel_noise, sensor.lateral_slip, sensor.vertical_slip, settings.loss, settings.loss_scale,
-            sensor.speed_noise, sensor.yaw_noise, sensor.steering_noise,
-        )  # fmt: skip
+    def first_noise(self, sensors: Sequence[Wheels], rig: Rig, measurements: Measurements) -> dict[str, WheelNoise]:
+        loss, scale = rig.settings.loss, rig.settings.loss_scale
+        return {
+            s.name: WheelNoise(
+                s.wheel_noise, s.lateral_slip, s.vertical_slip, loss, scale, s.speed_noise, s.yaw_noise,
+                s.steering_noise,
+            )
+            for s in sensors
+        }  # fmt: skip
 
     def factors(
         self, sensor: Wheels, stream: WheelStream | WheelPoses, noise: WheelNoise, at: Pass

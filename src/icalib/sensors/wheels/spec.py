@@ -145,6 +145,7 @@ class Wheels(MountedSensor):
 
     sensor_type: ClassVar[str] = "wheels"
     noun: ClassVar[str] = "wheels"
+    readings: ClassVar[str] = "readings"
     drives: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
