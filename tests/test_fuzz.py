@@ -27,8 +27,10 @@ def mutators(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="processes are forked")
-def test_some_cases():
-    command = [sys.executable, str(BENCHMARKS / "fuzz.py"), "--count", "300", "--seed", "1", "--covering"]
+@pytest.mark.parametrize("count", [60, pytest.param(300, marks=pytest.mark.full)])
+def test_some_cases(count: int):
+    """Those that have every kind of change of the first `count`."""
+    command = [sys.executable, str(BENCHMARKS / "fuzz.py"), "--count", str(count), "--seed", "1", "--covering"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
     assert ended.returncode == 0, ended.stdout[-5000:] + ended.stderr[-2000:]
     assert ": 0 failed" in ended.stdout and "; 0 good inputs refused" in ended.stdout

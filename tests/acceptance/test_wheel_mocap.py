@@ -7,6 +7,7 @@ recording state wheels of 84 mm and a baseline of 200 mm, "within about 1 %".
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -57,47 +58,53 @@ def drive_of(result: Calibration) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([g.value for g in groups]), np.concatenate([g.std for g in groups])
 
 
+RUNS = ("free-01", "square-01", "square-02")  # the free one, and those along squares
+EACH_RUN = [RUNS[0], *(pytest.param(name, marks=pytest.mark.full) for name in RUNS[1:])]
+
+
 @pytest.fixture(scope="module")
-def found(record, wheel_mocap: Path, tmp_path_factory) -> dict[str, Calibration]:
-    """The runs along squares, and the free one."""
-    out = {}
-    for name in ("square-01", "square-02", "free-01"):
+def found(record, wheel_mocap: Path, tmp_path_factory) -> Callable[[str], Calibration]:
+    """Calibrates a run, once."""
+
+    @cache
+    def result(name: str) -> Calibration:
         folder = record(tmp_path_factory.mktemp(name), run(wheel_mocap, name))
-        out[name] = icalib.calibrate(folder / "rig.yaml", folder)
-    return out
+        return icalib.calibrate(folder / "rig.yaml", folder)
+
+    return result
 
 
+@pytest.mark.parametrize("name", EACH_RUN)
+def test_a_run_gives_the_stated_drive_and_what_it_does_not_show(found, name):
+    result = found(name)
+    value, std = drive_of(result)
+    assert result.converged and np.abs(value / NOMINAL - 1.0).max() < 0.015
+    assert (std < [2e-4, 2e-4, 4.5e-3]).all()
+    ratios = {f.kind: f.chi2_per_dof for f in result.fits if f.sensor == "wheel0"}
+    assert 0.7 < ratios["wheels"] < 1.4, ratios
+    assert result.group("wheel0", "rotation").verdict[0] == "unobservable"
+    assert result.group("wheel0", "translation").verdict[2] == "unobservable"
+
+
+@pytest.mark.full
 def test_runs_agree(found):
-    drives = {name: drive_of(result) for name, result in found.items()}
-    assert all(result.converged for result in found.values())
-    for value, std in drives.values():
-        assert np.abs(value / NOMINAL - 1.0).max() < 0.015
-        assert (std < [2e-4, 2e-4, 4.5e-3]).all()
-    names = list(drives)
-    for a, b in zip(names, names[1:] + names[:1], strict=True):
+    drives = {name: drive_of(found(name)) for name in RUNS}
+    for a, b in zip(RUNS, RUNS[1:] + RUNS[:1], strict=True):
         (x, s), (y, t) = drives[a], drives[b]
         assert (np.abs(x - y) < 3.0 * np.hypot(s, t)).all(), (a, b, x - y, s, t)
         assert np.abs(x - y)[:2].max() < 1e-4 and abs(x - y)[2] < 1e-3
 
 
-def test_residuals_are_as_expected(found):
-    for result in found.values():
-        ratios = {f.kind: f.chi2_per_dof for f in result.fits if f.sensor == "wheel0"}
-        assert 0.7 < ratios["wheels"] < 1.4, ratios
-
-
-def test_what_a_flat_floor_does_not_show_is_said(found):
-    for result in found.values():
-        assert result.group("wheel0", "rotation").verdict[0] == "unobservable"
-        assert result.group("wheel0", "translation").verdict[2] == "unobservable"
-
-
 @pytest.mark.parametrize(
-    ("made", "checked"), [("square-01", "square-02"), ("square-02", "free-01"), ("free-01", "square-01")]
+    ("made", "checked"),
+    [
+        ("free-01", "square-01"),
+        *(pytest.param(*x, marks=pytest.mark.full) for x in (("square-01", "square-02"), ("square-02", "free-01"))),
+    ],
 )
 def test_heading_at_the_end_of_another_run(found, wheel_mocap, made, checked):
     """It drifts less than by the stated geometry, and no more than the standard deviations allow for."""
-    rows, result = run(wheel_mocap, checked), found[made]
+    rows, result = run(wheel_mocap, checked), found(made)
     drive, _ = drive_of(result)
     stated, ours = turned(rows, NOMINAL), turned(rows, drive)
     assert abs(stated) > 2.0 and abs(ours) < 0.7 * abs(stated)
@@ -106,10 +113,11 @@ def test_heading_at_the_end_of_another_run(found, wheel_mocap, made, checked):
     assert abs(ours) < 3.0 * np.sqrt(by_drive @ P @ by_drive)
 
 
+@pytest.mark.full
 def test_runs_together_with_an_offset_each(found, record, wheel_mocap, tmp_path):
     """They were aligned by hand, each by itself. Together they show the drive better than any does, and each the time
     offset that it shows alone."""
-    names = ("square-01", "square-02", "free-01")
+    names = RUNS
     folders = [record(tmp_path / name, run(wheel_mocap, name)) for name in names]
     rig = tmp_path / "rig.yaml"
     rig.write_text(RIG.replace("wheel_noise: 0.02", "wheel_noise: 0.02, clock_restarts: true"))
@@ -119,16 +127,16 @@ def test_runs_together_with_an_offset_each(found, record, wheel_mocap, tmp_path)
     assert offsets.labels == ("in recording 1", "in recording 2", "in recording 3")
     drive, std = drive_of(together)
     for k, name in enumerate(names):
-        alone = found[name].group("wheel0", "time_offset")
+        alone = found(name).group("wheel0", "time_offset")
         assert abs(offsets.value[k] - alone.value[0]) < 3.0 * np.hypot(offsets.std[k], alone.std[0])
-        x, s = drive_of(found[name])
+        x, s = drive_of(found(name))
         assert (np.abs(drive - x) < 3.0 * np.hypot(std, s)).all()
     # Not so of the baseline: what it owes to the guess of how the wheels are tilted no further run makes less.
-    formal = [found[name].group("wheel0", "radii").std_formal for name in names]
+    formal = [found(name).group("wheel0", "radii").std_formal for name in names]
     assert (together.group("wheel0", "radii").std_formal < np.min(formal, axis=0)).all()
 
 
-@pytest.mark.parametrize("name", ["circular-01", "circular-02"])
+@pytest.mark.parametrize("name", ["circular-01", pytest.param("circular-02", marks=pytest.mark.full)])
 def test_circles_alone_are_refused(record, wheel_mocap, tmp_path, name):
     """They show one ratio of radii and baseline."""
     folder = record(tmp_path / "recording", run(wheel_mocap, name))

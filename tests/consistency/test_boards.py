@@ -54,7 +54,7 @@ WIDE = {
     ),
     "omni-radtan": ("omni-radtan", (300.0, 298.0, 371.0, 245.0), (1.2, -0.1, 0.03, 3e-4, -2e-4), 40.0),
 }
-TWICE = {"eucm", "double-sphere, turned"}  # a lens of the same model is calibrated already
+ONLY_IN_FULL = {"eucm", "double-sphere", "double-sphere, turned", "omni-radtan"}
 
 
 # Recordings.
@@ -279,12 +279,14 @@ CASES: dict[str, Case] = {
     },
     **{
         f"a wide lens, {name}": Case(
-            lambda lens=own: wide(*lens), [exact(1e-7, lens=1e-6)], from_nothing, full=name in TWICE
+            lambda lens=own: wide(*lens), [exact(1e-7, lens=1e-6)], from_nothing, full=name in ONLY_IN_FULL
         )
         for name, own in WIDE.items()
     },
     "ChArUco": Case(lambda: of_target(Charuco(8, 7, 0.08, 0.06, "5x5_100")), [exact(1e-8), nothing_blooms], with_bloom),
-    "checkerboard": Case(lambda: of_target(Checkerboard(6, 7, 0.08)), [exact(1e-8), nothing_blooms], with_bloom),
+    "checkerboard": Case(
+        lambda: of_target(Checkerboard(6, 7, 0.08)), [exact(1e-8), nothing_blooms], with_bloom, full=True
+    ),
     # Honest with noise.
     # With xi of the other sign a double sphere fits to 0.01 px, far below the noise of 0.2 px.
     "double sphere finds the right valley": Case(double_sphere, [known()], from_nothing),
@@ -313,7 +315,7 @@ CASES: dict[str, Case] = {
         turning("planar", "noisy", 1), [known(), lever_arm_is_at_the_guess], guessed("prior", 1), full=True
     ),
     "turning about one axis, noisy IMU": Case(
-        turning("single_axis", "noisy", 1), [known(), lever_arm_is_at_the_guess], guessed("prior", 1)
+        turning("single_axis", "noisy", 1), [known(), lever_arm_is_at_the_guess], guessed("prior", 1), full=True
     ),
     "turning about one axis, from nothing": Case(
         turning("single_axis"),
@@ -326,7 +328,7 @@ CASES: dict[str, Case] = {
         BY_HAND, [drifts_by(-300.0, "not usable")], lens("fixed"), late(lambda t: 3e-4 * t)
     ),
     "a clock is 100 ppm slow": Case(
-        BY_HAND, [drifts_by(100.0, "usable with care")], lens("fixed"), late(lambda t: -1e-4 * t)
+        BY_HAND, [drifts_by(100.0, "usable with care")], lens("fixed"), late(lambda t: -1e-4 * t), full=True
     ),
     "a clock is 60 ppm fast": Case(
         BY_HAND, [drifts_by(-60.0, "usable with care")], lens("fixed"), late(lambda t: 6e-5 * t), full=True

@@ -99,6 +99,7 @@ def test_errors_that_stay_for_a_second_show():
     assert found.optimistic and found.excess > 2.0 * found.expected
 
 
+@pytest.mark.full
 def test_a_short_recording_is_split_into_as_many_parts_as_it_has():
     scenario = handheld(3.0)
     rig = rig_for(scenario, settings=replace(PLAIN, segments=25), intrinsics="start", distortion="start")
@@ -139,6 +140,7 @@ def test_without_an_imu_parts_are_runs_of_images():
     assert as_noise_makes_it(found)
 
 
+@pytest.mark.full
 def test_where_planes_are_in_the_world_is_nothing_to_predict(robot: Callable[..., Scenario]):
     """A LiDAR and an IMU: nobody sees where the world's origin is, nor which way it faces."""
     scenario = robot("3d", 15.0, "l")

@@ -80,6 +80,7 @@ def test_gross_outliers_are_rejected_with_a_note(lens: tuple, model: str):
     assert not pattern_of(result)
 
 
+@pytest.mark.full
 def test_outliers_beside_an_error_of_the_lens_are_rejected_and_the_rest_is_not():
     rig, measurements, wrong = stills(WIDE, "pinhole-radtan", 3, outliers=0.02)
     result = calibrate_measurements(rig, measurements)

@@ -102,12 +102,14 @@ def test_a_clock_that_ran_on_is_no_worse(robot):
     assert one.group("cam0", "time_offset").labels == ("time_offset",)
 
 
+@pytest.mark.full
 def test_one_recording_has_one(robot):
     scenario = robot("3d", 14.0, "c")
     result = joint((simulate(scenario, 1),), open_rig(scenario, "c"))
     assert result.group("cam0", "time_offset").labels == ("time_offset",)
 
 
+@pytest.mark.full
 def test_a_prior_is_one_of_each(robot):
     """It moves both offsets as it moves one."""
     scenario = robot("3d", 14.0, "c")
@@ -126,6 +128,7 @@ def test_without_saying_so_it_is_named(robot):
         joint(simulations, open_rig(simulations[0].scenario, ""))
 
 
+@pytest.mark.full
 def test_a_stream_that_outlasts_the_others(robot):
     """Recordings follow one another on one clock, whichever of their sensors is looked at first."""
     scenario = robot("ramp", 18.0, "cw")

@@ -58,7 +58,7 @@ def wrong(sensor: Sensor, what: str) -> dict[str, np.ndarray]:
     return {"time_offset": t + {"seconds": 3.0, "hours": 7200.0}[what]}
 
 
-IN_CI = {("wheels", "link"), ("wheels", "millimetres"), ("wheels", "hours"), ("poses", "inverse"), ("poses", "seconds")}
+IN_CI = {("wheels", "link"), ("wheels", "millimetres"), ("poses", "seconds")}
 WRONG = list(product(("wheels", "poses"), ("inverse", "link", "millimetres", "seconds", "hours")))
 
 
@@ -96,7 +96,7 @@ def drawn(rig: Rig, rng: np.random.Generator) -> Rig:
     return rig
 
 
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(k, marks=pytest.mark.full) for k in range(6, 24))])
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(k, marks=pytest.mark.full) for k in range(3, 24))])
 def test_no_guess_ends_the_first_guess_but_in_a_sentence(simulation, seed):
     rig = drawn(rig_for(simulation.scenario, **STARTS), np.random.default_rng(seed))
     try:

@@ -56,7 +56,11 @@ def calibrated(
     ("make", "source"),
     [
         (lambda _: stereo(), "the size of the target alone: 1 % error there is 1 % in every length here"),
-        (lambda p: p.camera_wheels(), "the size of the target alone: .* every length here"),
+        pytest.param(
+            lambda p: p.camera_wheels(),
+            "the size of the target alone: .* every length here",
+            marks=pytest.mark.full,
+        ),
         (lambda p: p.wheels_poses_imu(), "the positions of mocap0 alone: .* every length here"),
     ],
 )
@@ -71,7 +75,12 @@ def test_one_source_alone_is_named(program: ModuleType, make: Callable[[ModuleTy
     ("make", "how", "both"),
     [
         (lambda _: mocap(), {}, "the size of the target and the positions of mocap0"),
-        (lambda p: p.camera_wheels(), {"wheels_known": True}, "the size of the target and the stated sizes of wheel0"),
+        pytest.param(
+            lambda p: p.camera_wheels(),
+            {"wheels_known": True},
+            "the size of the target and the stated sizes of wheel0",
+            marks=pytest.mark.full,
+        ),
         (lambda p: p.poses_imu(), {"imu": True}, "the positions of mocap0 and the accelerometer"),
     ],
 )

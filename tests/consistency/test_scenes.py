@@ -116,6 +116,7 @@ def test_a_scene_that_was_changed_between_recordings_is_named():
         calibrate_measurements(rig, recordings)
 
 
+@pytest.mark.full
 def test_a_small_change_is_named_beside_noise():
     rig, pair = moved_between([0.0, 0.01, 0.02], noiseless=False)
     bodies, recordings = chosen(rig, pair)
@@ -134,7 +135,7 @@ def chosen(rig: Rig, recordings: list[Measurements]) -> tuple[Bodies, list[Measu
     return bodies, [restrict(bodies, r) for r in recordings]
 
 
-@pytest.mark.parametrize("count", [1, 4, 200])
+@pytest.mark.parametrize("count", [4, *(pytest.param(n, marks=pytest.mark.full) for n in (1, 200))])
 def test_a_scene_that_stayed_is_no_change(count: int):
     """However few images one of the recordings has: in a scene of its own they fit better by chance."""
     rig, (first, second) = moved_between([0.0, 0.0, 0.0], noiseless=False)
@@ -144,6 +145,7 @@ def test_a_scene_that_stayed_is_no_change(count: int):
     np.testing.assert_allclose(scene_error_ratios(rig, scene, recordings), 1.0, atol=0.15)
 
 
+@pytest.mark.full
 def test_a_wrong_lens_is_no_change_of_the_scene():
     """Ten images alike hide it in a scene of their own."""
     rig, (first, second) = moved_between([0.0, 0.0, 0.0], noiseless=False)
@@ -158,6 +160,7 @@ def test_a_wrong_lens_is_no_change_of_the_scene():
     check_bodies_still(rig, find_scene(rig, bodies, recordings), recordings)
 
 
+@pytest.mark.full
 def test_of_three_recordings_the_one_that_was_changed_is_named():
     rig, (old, new) = moved_between([0.0, 0.02, 0.03], noiseless=False)
     third = dataclasses.replace(simulate(tag_map(8.0), 2).measurements, name="third")

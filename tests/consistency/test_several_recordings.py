@@ -124,6 +124,7 @@ def test_the_information_of_the_pair_is_the_sum_of_both(noisy, noisy_joint):
     assert np.abs(ratio - 1.0).max() < 0.1
 
 
+@pytest.mark.full
 def test_a_list_of_one_is_one_recording(noisy):
     rig = rig_of(noisy[1])
     one, listed = (calibrate_measurements(rig, m) for m in (noisy[1].measurements, [noisy[1].measurements]))
@@ -135,6 +136,7 @@ def test_a_list_of_one_is_one_recording(noisy):
     assert one.notes == listed.notes
 
 
+@pytest.mark.full
 def test_the_order_of_recordings_does_not_matter(noisy, noisy_joint):
     turned = joint(noisy[::-1], rig_of(noisy[0]))
     for camera in ("cam0", "cam1"):
@@ -185,7 +187,7 @@ def later(imu: ImuStream, ns: int) -> ImuStream:
     return dataclasses.replace(imu, stamps_ns=imu.stamps_ns + np.int64(ns))
 
 
-@pytest.mark.parametrize("shift_ns", [300_000_000, 10**15])
+@pytest.mark.parametrize("shift_ns", [300_000_000, pytest.param(10**15, marks=pytest.mark.full)])
 def test_a_clock_that_was_set_between_recordings_is_named(noisy, shift_ns: int):
     first, other = (s.measurements for s in noisy)
     moved = dataclasses.replace(other.with_streams(later(other.imu, shift_ns)), name="evening")
@@ -291,6 +293,7 @@ def test_images_that_outlast_the_imu_are_left_out(noisy):
     assert sum("images of cam" in n and "left out" in n for n in result.notes) == 2
 
 
+@pytest.mark.full
 def test_three_recordings_share_bloom_and_bow():
     """What is of the target or of its image is the same in all, whichever way the target leans."""
     seconds = (9.0, 8.0, 7.0)

@@ -80,7 +80,7 @@ def inverse(stream: PoseStream) -> PoseStream:
     return replace(stream, rotation=back, position=-np.einsum("nij,nj->ni", back, stream.position))
 
 
-@pytest.mark.parametrize("count", [4, 20])
+@pytest.mark.parametrize("count", [4, pytest.param(20, marks=pytest.mark.full)])
 def test_without_noise_it_is_recovered(count, tmp_path):
     x = stills(count, noisy=False)
     result = calibrate_measurements(x.rig, x.measurements)
@@ -93,6 +93,7 @@ def test_without_noise_it_is_recovered(count, tmp_path):
     assert load_calibration(tmp_path).body == "cam0"
 
 
+@pytest.mark.full
 def test_nees():
     runs = []
     for seed in range(16):
@@ -105,7 +106,7 @@ def test_nees():
     assert low < np.sum(runs) < high, np.array(runs) / 6
 
 
-@pytest.mark.parametrize("count", [4, 5, 7])
+@pytest.mark.parametrize("count", [5, *(pytest.param(n, marks=pytest.mark.full) for n in (4, 7))])
 def test_degrees_of_freedom_of_few_pairs(count):
     """Six a pair, but for mount and frame; the camera's poses, about four times as good, take a few per cent of them.
     Two draws only had been off by 40 %, and standard deviations with them."""
@@ -181,7 +182,7 @@ def test_poses_of_other_images_are_refused():
         calibrate_measurements(x.rig, changed(x, rotation=stream.rotation[order], position=stream.position[order]))
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.13])
+@pytest.mark.parametrize("late_s", [0.13, pytest.param(0.0, marks=pytest.mark.full)])
 def test_poses_are_streamed_while_the_robot_goes_from_stop_to_stop(late_s):
     """Half of each second it stands still; images are taken then, by another clock."""
     x = stills(16)
@@ -198,6 +199,7 @@ def test_poses_are_streamed_while_the_robot_goes_from_stop_to_stop(late_s):
     assert np.abs(e / np.sqrt(np.diag(P))).max() < 4.0
 
 
+@pytest.mark.full
 def test_several_recordings_each_with_a_board_of_its_own():
     one, two = stills(10, seed=1), stills(12, seed=2)
     moved = replace(two.measurements.poses[0], position=two.measurements.poses[0].position + [0.5, 0.0, 1.0])

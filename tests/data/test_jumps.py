@@ -158,7 +158,7 @@ def test_commands_that_read_an_imu_alone(tmp_path: Path):
     ("which", "index"),
     [
         ("imu", 500),
-        ("cameras", 1400),
+        pytest.param("cameras", 1400, marks=pytest.mark.full),
         pytest.param("imu", 1400, marks=pytest.mark.full),
         pytest.param("cameras", 500, marks=pytest.mark.full),
     ],

@@ -71,10 +71,24 @@ IMAGES = 2  # fewer have too few corners for the bound on their mean
 CROWDED_SIGMA_PX = 0.035  # of corners so near to the bits of their tag that these may move them
 
 
+IN_CI = ("kalibr", "charuco", "checkerboard", "apriltag")  # one of each kind
+
+
+@each("pose", POSES)
+@each("target", IN_CI)
+def test_corners_are_right(rendering, target, pose):
+    corners_are_right(rendering, target, pose, 0.7)
+
+
+@pytest.mark.full
 @each("pose", POSES)
 @each("target", TARGETS)
-@pytest.mark.parametrize("blur", [0.7, pytest.param(1.2, marks=pytest.mark.full)])
-def test_corners_are_right(rendering, target, pose, blur):
+@pytest.mark.parametrize("blur", [0.7, 1.2])
+def test_corners_of_all_targets_are_right(rendering, target, pose, blur):
+    corners_are_right(rendering, target, pose, blur)
+
+
+def corners_are_right(rendering, target, pose, blur):
     (kind, *arguments), detector, y_up, least = TARGETS[target]
     pattern = getattr(rendering, kind)(*arguments)
     distance, tilt, turn, roll, offset = POSES[pose]
@@ -100,9 +114,23 @@ def test_corners_are_right(rendering, target, pose, blur):
         assert np.abs(uv.mean(axis=0)).max() < 0.02
 
 
-@each(("family", "side"), [("APRILTAG_36H11", 18), ("APRILTAG_36H11", 20), ("4X4_50", 14), ("4X4_50", 17)])
+SIDES = [("APRILTAG_36H11", 18), ("4X4_50", 14), ("APRILTAG_36H11", 20), ("4X4_50", 17)]
+
+
+@each(("family", "side"), SIDES[:2])
 @each("blur", [0.6, 0.8])
 def test_small_tags_are_kept_with_a_sigma_that_is_right(rendering, family, side, blur):
+    small_tags_are_kept(rendering, family, side, blur)
+
+
+@pytest.mark.full
+@each(("family", "side"), SIDES[2:])
+@each("blur", [0.6, 0.8])
+def test_tags_that_are_less_small_are_kept_with_a_sigma_that_is_right(rendering, family, side, blur):
+    small_tags_are_kept(rendering, family, side, blur)
+
+
+def small_tags_are_kept(rendering, family, side, blur):
     """Sides [px] for which the bits are too near to the edges: their errors are larger, and so is their sigma."""
     ids = (1, 5, 9)
     pattern = rendering.markers(family, list(ids), 1)
@@ -120,7 +148,7 @@ def test_small_tags_are_kept_with_a_sigma_that_is_right(rendering, family, side,
     assert np.sqrt((ratio**2).mean()) < 1.25 and np.abs(ratio).max() < 4.0
 
 
-@pytest.mark.parametrize("target", ["kalibr", "two-bit plain"])
+@pytest.mark.parametrize("target", ["kalibr", pytest.param("two-bit plain", marks=pytest.mark.full)])
 def test_sigma_is_the_scatter_under_noise(rendering, target):
     (kind, *arguments), detector, y_up, _ = TARGETS[target]
     pattern = getattr(rendering, kind)(*arguments)

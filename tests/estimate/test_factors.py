@@ -822,9 +822,9 @@ def sample_of(unlike, setup_of, factor_of, features_of, features_on_planes, spar
     return made_as
 
 
-def directions(sample, H):
-    """(n, m): steps of one column each, for two keyframes and all calibration parameters of the factor, and random
-    steps of all other columns at once, in which a wrong sum shows as well."""
+def directions(sample, H, singly):
+    """(n, m): random steps of all columns at once, in which a wrong sum shows. singly: instead of them one column each,
+    for two keyframes and all calibration parameters of the factor, so that none is small beside the others."""
     chain, rng = KEYFRAME_DIM * len(sample.state.seconds), np.random.default_rng(10)
     first = KEYFRAME_DIM * (len(sample.state.seconds) // 2)
     counts = np.diag(H) > 0.0
@@ -832,6 +832,7 @@ def directions(sample, H):
         counts
         & (np.arange(len(H)) >= first)
         & ((np.arange(len(H)) >= chain) | (np.arange(len(H)) < first + 2 * KEYFRAME_DIM))
+        & singly
     )
     mixed = [
         rng.normal(size=(len(H), m)) * (own & ~alone)[:, None] / np.sqrt(max(1, (own & ~alone).sum()))
@@ -840,13 +841,25 @@ def directions(sample, H):
     return np.concatenate([np.eye(len(H))[:, alone], *mixed], axis=1)
 
 
+FIRST = {factor: name for name, (factor, _) in reversed(SAMPLES.items())}  # the first sample of each factor
+
+
 @each("name", SAMPLES)
 def test_sums_are_those_of_numeric_derivatives(name, sample_of, dense):
-    sample = sample_of(name)
+    sums_are_those_of_numeric_derivatives(sample_of(name), dense, name in FIRST.values())
+
+
+@pytest.mark.full
+@each("name", SAMPLES)
+def test_sums_are_those_of_numeric_derivatives_by_each_column(name, sample_of, dense):
+    sums_are_those_of_numeric_derivatives(sample_of(name), dense, True)
+
+
+def sums_are_those_of_numeric_derivatives(sample, dense, singly):
     _, H, g = sums_of(sample, dense)
     y, W = sample.weights(sample.state)
     scale, h = scales(sample), 5e-3
-    D = directions(sample, H) * scale[:, None]
+    D = directions(sample, H, singly) * scale[:, None]
     J, slope = np.empty((len(y), D.shape[1])), np.empty(D.shape[1])
     for n, d in enumerate(h * D.T):
         # Five points, whose error is of the fourth order, so that the step is large beside the rounding of

@@ -56,7 +56,7 @@ def too_large(setup, state, bound):
     return {k: e for k, e in errors(setup, state).items() if not e < bound}
 
 
-@pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.parametrize("asynchronous", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_noiseless_recovery(setup_of, problem_of, asynchronous):
     scenario = without_bias(handheld(5.0, asynchronous=asynchronous, noiseless=True))
     setup = setup_of(simulate(scenario, seed=1))
@@ -69,7 +69,7 @@ def test_noiseless_recovery(setup_of, problem_of, asynchronous):
     assert not_none(outcome).cost < 1e-9
 
 
-@pytest.mark.parametrize("asynchronous", [False, True])
+@pytest.mark.parametrize("asynchronous", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_noiseless_recovery_with_biases(setup_of, problem_of, asynchronous):
     """The prior on the first biases takes a share that shrinks with the recording's length: 20 s are enough."""
     setup = setup_of(simulate(handheld(20.0, asynchronous=asynchronous, noiseless=True), seed=1))

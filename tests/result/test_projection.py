@@ -64,8 +64,12 @@ def test_every_model_is_tried():
     assert set(LENSES) == set(CAMERA_MODELS)
 
 
+DRAWN = [("pinhole-radtan", True), ("double-sphere", False)]  # the others in `full`
+ALL_DRAWN = [(n, False) for n in LENSES] + [("pinhole-radtan", True), ("pinhole-equidistant", True)]
+
+
 @pytest.mark.parametrize(
-    ("name", "near"), [(n, False) for n in LENSES] + [("pinhole-radtan", True), ("pinhole-equidistant", True)]
+    ("name", "near"), [pytest.param(*x, marks=() if x in DRAWN else pytest.mark.full) for x in ALL_DRAWN]
 )
 def test_it_is_that_of_drawn_lenses(name: str, near: bool):
     """1200 draws: 2 % at one pixel, the same side at all of them."""

@@ -25,7 +25,9 @@ BOARDS = {
 TURNED_DEG = 100.0  # between the images before and after a gap: nearer to the wrong half turn
 
 
-@pytest.fixture(scope="module", params=BOARDS)
+@pytest.fixture(
+    scope="module", params=["halves", *(pytest.param(x, marks=pytest.mark.full) for x in ("quarters", "circles"))]
+)
 def simulation(request) -> Simulation:
     """A rig that is turned by up to 180 degrees in front of the board."""
     scenario = handheld(20.0)

@@ -109,7 +109,7 @@ def test_what_the_rig_gives_stays():
     assert abs(errors(simulation, values, "cam0")[2]) < 0.02
 
 
-@pytest.mark.parametrize("restarts", [True, False])
+@pytest.mark.parametrize("restarts", [True, pytest.param(False, marks=pytest.mark.full)])
 def test_of_several_recordings_one_shows_how_the_camera_stands(restarts):
     """And each the offset of a clock that was set back between them."""
     drives = drive(duration_s=12.0), drive(seed=2, set_back_s=37 if restarts else 0)

@@ -127,7 +127,7 @@ def test_tracks_of_another_drive_do_not_match():
     [
         pytest.param("radtan", 1, 5.0, marks=pytest.mark.full),
         ("radtan", 2, 0.25),
-        ("fisheye", 3, 0.5),
+        pytest.param("fisheye", 3, 0.5, marks=pytest.mark.full),
         pytest.param("double sphere", 4, 5.0, marks=pytest.mark.full),
     ],
 )

@@ -75,7 +75,7 @@ def check_mins(result: Calibration, sim: Simulation):
     assert np.median(np.linalg.norm(expected - reported.position, axis=1)) < 0.02
 
 
-@pytest.mark.parametrize("motion", ["free", "ramps"])
+@pytest.mark.parametrize("motion", ["free", pytest.param("ramps", marks=pytest.mark.full)])
 def test_lever_arm_and_clock_from_nothing(motion):
     sim = recorded(motion, antenna())
     result = calibrated(sim)
@@ -181,7 +181,10 @@ def test_a_leap_second_offset_is_named():
     assert any("18 s between GPS time and UTC" in note for note in result.notes)
 
 
-@pytest.mark.parametrize(("hours", "told"), [(30.0, "30.0 hours after imu0"), (72.0, "3.0 days after imu0")])
+@pytest.mark.parametrize(
+    ("hours", "told"),
+    [(30.0, "30.0 hours after imu0"), pytest.param(72.0, "3.0 days after imu0", marks=pytest.mark.full)],
+)
 def test_fixes_of_another_day(hours, told):
     """Unix stamps on both sides: the same rig, the next day, along another path."""
     sim, other = (recorded("free", antenna(), seed=seed, duration_s=25.0) for seed in (1, 2))

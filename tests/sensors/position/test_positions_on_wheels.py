@@ -89,7 +89,11 @@ def test_wrong_sizes():
 
 
 @pytest.mark.parametrize(
-    ("reports", "sizes"), [("twist", ("scales",)), ("steering", ("radius", "wheelbase", "steering_offset"))]
+    ("reports", "sizes"),
+    [
+        pytest.param("twist", ("scales",), marks=pytest.mark.full),
+        ("steering", ("radius", "wheelbase", "steering_offset")),
+    ],
 )
 def test_other_wheels(reports, sizes):
     """With an offset of the steering, dead reckoning without it turns too far; the drive repeats every 12 s."""

@@ -66,7 +66,7 @@ def calibrated(scenario, seed=1):
     return calibrate_measurements(rig_for(scenario), sim.measurements), sim
 
 
-@pytest.mark.parametrize("frame", MADE)
+@pytest.mark.parametrize("frame", ["target", *(pytest.param(x, marks=pytest.mark.full) for x in ("mocap0", "gnss1"))])
 def test_exact_without_noise(frame):
     result, sim = calibrated(MADE[frame](**SILENT))
     error, _ = errors(result, sim)

@@ -82,7 +82,7 @@ def test_three_hours_give_densities_and_walks():
         assert study.warnings == ()
 
 
-@pytest.mark.parametrize("seconds", [600.0, 3600.0])
+@pytest.mark.parametrize("seconds", [600.0, pytest.param(3600.0, marks=pytest.mark.full)])
 def test_errors_are_as_large_as_their_standard_deviations(seconds: float):
     """Mean NEES over 300 seeds inside the 99.9 % bounds of chi^2, of a gyroscope read at 50 Hz."""
     n, period, white, walk = int(seconds * 50), 0.02, TRUTH["gyro"], TRUTH["gyro_walk"]

@@ -59,6 +59,7 @@ def records(folder: Path) -> dict[str, int]:
     return {f.parent.name: f.stat().st_mtime_ns for f in (folder / "out" / "jobs").glob("*/fleet-job.json")}
 
 
+@pytest.mark.full
 def test_a_killed_fleet_goes_on_and_repeats_nothing(fleet_folder: Path, workers_replaced):
     process = started(fleet_folder, _FLEET, fleet_folder / "JOBS.yaml", fleet_folder / "out")
     wait_for(process, fleet_folder, "out/jobs/*/fleet-job.json")
@@ -96,6 +97,7 @@ def test_the_job_of_a_killed_worker_is_done_again(fleet_folder: Path, results, s
     assert set(one.inputs) >= {str(load_jobs(fleet_folder / "JOBS.yaml")[0].rig)}
 
 
+@pytest.mark.full
 def test_a_killed_scheduler_is_one_sentence_and_loses_nothing(fleet_folder: Path, workers_replaced):
     process = started(fleet_folder, _CLUSTER, fleet_folder / "address")
     try:

@@ -97,6 +97,7 @@ def test_a_study_that_was_killed_goes_on_and_repeats_nothing(alone: Path, tmp_pa
     assert (folder / "consistency.json").read_bytes() == (alone / "consistency.json").read_bytes()
 
 
+@pytest.mark.full
 def test_the_run_of_a_killed_worker_is_made_again():
     records = run_all([RunTask(handheld(6.0), seed) for seed in range(4)], workers=2)
     found = [next(records)]
@@ -107,6 +108,7 @@ def test_the_run_of_a_killed_worker_is_made_again():
     assert sorted(r.seed for r in found) == [0, 1, 2, 3] and not any(r.failure for r in found)
 
 
+@pytest.mark.full
 def test_studies_run_side_by_side():
     """Dask takes the port of its dashboard even without one, and warns where another study has it."""
     with ExitStack() as stack:
@@ -124,6 +126,7 @@ def test_a_finished_study_starts_no_worker(alone: Path, monkeypatch):
     assert written(alone) == before
 
 
+@pytest.mark.full
 def test_more_runs_are_added_by_a_cluster(alone: Path, tmp_path: Path):
     distributed = load_distributed()
     study(tmp_path, 1, workers=1)
