@@ -8,6 +8,7 @@ import io
 import os
 import re
 import time
+from collections import Counter
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest.mock import patch
@@ -33,8 +34,9 @@ class Record:
     """One calibration, or the sentence that refuses it.
 
     values, std, verdict: by "sensor.parameter". chi2: of all residuals. visits: states at which the solver looked for a
-    step. cpu_s: processor time from the files to the result. overall: the verdict on the result. files: sha256 of each
-    file of result and exports, and of the console's text ("console"), by name; date, versions and times are left out.
+    step. cpu_s: processor time from the files to the result. overall: the verdict on the result. reason_names,
+    note_names: identifier of each sentence. files: sha256 of each file of result and exports, and of the console's text
+    ("console"), by name; date, versions and times are left out.
     """
 
     values: dict[str, list[float]] = field(default_factory=dict)
@@ -46,7 +48,9 @@ class Record:
     cpu_s: float = 0.0
     overall: str = ""
     reasons: list[str] = field(default_factory=list)
+    reason_names: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    note_names: list[str] = field(default_factory=list)
     refusal: str = ""
     files: dict[str, str] = field(default_factory=dict)
 
@@ -74,7 +78,8 @@ def record_case(case: Case, data: Path, rounds: int = 1) -> Record:
             _run(inputs, k)
         found, visits, spent = _run(inputs, rounds - 1)
         if isinstance(found, CalibrationError):
-            return Record(cpu_s=spent, refusal=str(found), notes=list(getattr(found, "__notes__", ())))
+            notes = getattr(found, "__notes__", ())
+            return Record(cpu_s=spent, refusal=str(found), notes=[*notes], note_names=[note.name for note in notes])
         return replace(record_of(found), visits=visits, cpu_s=spent)
 
 
@@ -109,7 +114,9 @@ def record_of(result: Calibration) -> Record:
         float(sum(f.chi2 for f in result.fits)),
         overall=result.verdict,
         reasons=list(result.reasons),
+        reason_names=[remark.name for remark in result.reasons],
         notes=list(result.notes),
+        note_names=[remark.name for remark in result.notes],
         files=_digests(result),
     )
 
@@ -145,6 +152,9 @@ def changed(old: Record, new: Record) -> Change:
     words = [f"{key} is only in one of both" for key in sorted(old.values.keys() ^ new.values.keys())]
     words += ["convergence differs"] if old.converged != new.converged else []
     words += [f"{old.overall} became {new.overall}"] if old.overall != new.overall else []
+    for kind in ("reason_names", "note_names"):
+        a, b = Counter(getattr(old, kind)), Counter(getattr(new, kind))
+        words += [f"{kind}: {verb}: {name}" for verb, some in (("went", a - b), ("came", b - a)) for name in some]
     moved, scaled, relative = [0.0], [0.0], [abs(new.chi2 - old.chi2) / max(old.chi2, 1e-300)]
     for key in sorted(old.values.keys() & new.values.keys()):
         if old.verdict[key] != new.verdict[key]:

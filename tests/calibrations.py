@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.remarks import remark
 from tests.typed import instance
 
 from icalib.geometry.targets import AprilGrid
@@ -64,7 +65,7 @@ def calibration() -> Calibration:
         covariance=_covariance(groups, rng),
         covariance_names=names,
         null_space=_null_space(names),
-        unobservable=("cam1 translation y: turn the rig about a second axis to determine it.",),
+        unobservable=(remark("cam1 translation y: turn the rig about a second axis to determine it."),),
         fits=tuple(_fits()),
         residuals=by_key(
             [
@@ -77,9 +78,16 @@ def calibration() -> Calibration:
         converged=True,
         status="converged after 8 iterations: the predicted decrease of chi^2 fell below 1e-3.",
         warnings=(
-            "the accelerometer of imu0 leaves residuals 1.6 times as large as its noise says; a larger one fits.",
+            remark(
+                "the accelerometer of imu0 leaves residuals 1.6 times as large as its noise says; a larger one fits."
+            ),
         ),
-        notes=("IMU noise (default for a consumer IMU): gyro 1.6e-4 rad/s/sqrt(Hz).", "3 corners <repaired> & kept."),
+        notes=tuple(
+            map(
+                remark,
+                ("IMU noise (default for a consumer IMU): gyro 1.6e-4 rad/s/sqrt(Hz).", "3 corners <repaired> & kept."),
+            )
+        ),
         rig=rig_to_dict(rig),
         rates={"imu0": 200.0, "cam0": 20.0, "cam1": 20.0},
         inputs={"recording/imu0/data.csv.gz": "ab" * 32, "recording/cam0/corners.csv.gz": "cd" * 32},

@@ -17,7 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401 its BLAS is another than that of numpy
+from tests.remarks import is_pinned
 from threadpoolctl import threadpool_limits
+
+from icalib.base.remark import Remark
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 WHOLE_RUNS = ("acceptance", "consistency")  # folders of tests that calibrate from measurements to the result
@@ -76,6 +79,20 @@ def benchmark_program() -> Callable[[str], ModuleType]:
             return importlib.import_module(name)
 
     return imported
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _pinned_sentences() -> Iterator[None]:
+    """Every remark of every test has the sentence that sentences.yaml pins for its identifier."""
+    new = Remark.__new__
+
+    def checked(cls: type[Remark], name: str, sentence: str) -> Remark:
+        assert is_pinned(name, sentence), f"{name}: tests/sentences.yaml has another sentence than {sentence!r}"
+        return new(cls, name, sentence)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Remark, "__new__", checked)
+        yield
 
 
 def _recording(name: str) -> Path:

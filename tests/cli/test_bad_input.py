@@ -263,7 +263,8 @@ def test_what_can_be_mended_is_mended_with_a_note(tables, tmp_path, capsys):
         damage(tables)
     rig, recording = tables.write(tmp_path)
     assert main(["calibrate", str(rig), str(recording), "-o", str(tmp_path / "out")]) == 0
-    words = " ".join(yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["notes"])
+    notes = yaml.safe_load((tmp_path / "out" / "calibration.yaml").read_text())["notes"]
+    words = " ".join(sentence for note in notes for sentence in note.values())
     assert re.search(r"imu0/data\.csv:52: .*not a finite number; the line was left out", words)
     assert re.search(r"cam0/corners\.csv:52: .*the line was left out", words)
     assert re.search(r"imu0/data\.csv: the stamps are read as microseconds", words)

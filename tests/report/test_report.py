@@ -15,6 +15,7 @@ import pytest
 import yaml
 from rich.console import Console
 from scipy.spatial.transform import Rotation
+from tests.remarks import remark
 
 from icalib.export.formats import check_folder, write_outputs
 from icalib.report import report_html
@@ -119,9 +120,9 @@ def test_all_text_is_escaped(calibration: Calibration):
     nasty = dataclasses.replace(
         calibration,
         status=NASTY,
-        unobservable=(NASTY,),
-        warnings=(f"{NASTY} again",),
-        notes=(NASTY,),
+        unobservable=(remark(NASTY),),
+        warnings=(remark(f"{NASTY} again"),),
+        notes=(remark(NASTY),),
         inputs={NASTY: NASTY},
         settings={NASTY: NASTY},
         covariance_names=(NASTY, *calibration.covariance_names[1:]),
@@ -243,7 +244,8 @@ def test_nothing_seen_and_nothing_iterated(calibration: Calibration):
 
 def test_reasons_stand_in_their_order_and_once(calibration: Calibration):
     groups = tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups)
-    words = {"warnings": ("mind.", "it is too large."), "wrong": ("it is too large.",)}
+    mind, large = remark("mind."), remark("it is too large.")
+    words = {"warnings": (mind, large), "wrong": (large,)}
     mistaken = dataclasses.replace(calibration, unobservable=(), groups=groups, **words)
     page = report_html(mistaken)
     assert page.index('<li class="bad">it is too large.') < page.index('<li class="care">mind.')
@@ -382,7 +384,7 @@ def test_the_console_begins_with_extrinsics_and_time_offsets(calibration: Calibr
 )
 def test_the_console_shows_what_a_reason_names(calibration: Calibration, reason: str, rows_named: list):
     brief = shown_rows(dataclasses.replace(calibration, warnings=(), unobservable=()), verbose=False)
-    shown = shown_rows(dataclasses.replace(calibration, warnings=(reason,), unobservable=()), verbose=False)
+    shown = shown_rows(dataclasses.replace(calibration, warnings=(remark(reason),), unobservable=()), verbose=False)
     assert [(row.sensor, row.name) for row in shown if row not in brief] == rows_named
 
 

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from tests.remarks import names, remark
 
+from icalib.base.remark import Remark
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, ParameterGroup, by_key, load_calibration
 from icalib.result.calibration import RecordingSpan
@@ -40,6 +42,22 @@ def test_round_trip_of_what_is_not_finite_or_empty(
     odd.save(tmp_path)
     found = load_calibration(tmp_path)
     assert same(found, odd)
+
+
+def test_identifiers_are_loaded_and_those_of_earlier_results_are_unknown(calibration: Calibration, tmp_path: Path):
+    gap, drift = Remark("imu_gap", "imu0 has a gap of 1.000 s at 2.000 s, bridged."), remark("it drifts.")
+    dataclasses.replace(calibration, notes=(gap, drift), warnings=(gap,), wrong=(gap,)).save(tmp_path)
+    again = load_calibration(tmp_path)
+    assert [names(x) for x in (again.notes, again.wrong)] == [["imu_gap", "unknown"], ["imu_gap"]]
+    path = tmp_path / "result.json"
+    plain = json.loads(path.read_text(encoding="utf-8"))
+    assert plain["identifiers"]["reasons"] == names(again.reasons) and names(again.reasons)[0] == "imu_gap"
+    path.write_text(json.dumps({key: x for key, x in plain.items() if key != "identifiers"}), encoding="utf-8")
+    old = load_calibration(tmp_path)
+    assert old.notes == again.notes and names(old.notes) == ["unknown", "unknown"]
+    path.write_text(json.dumps(plain | {"identifiers": plain["identifiers"] | {"notes": []}}), encoding="utf-8")
+    with pytest.raises(CalibrationError, match="damaged"):
+        load_calibration(tmp_path)
 
 
 def test_arrays_need_no_pickle(saved: Path):
@@ -85,7 +103,7 @@ def test_yaml_is_what_the_design_says(calibration: Calibration, saved: Path):
     assert np.shape(data["targets"]["board0"]["tilt"]) == (3, 3)
     assert data["fits"][0]["chi2_per_dof"] == pytest.approx(20011.2 / 19800.5)
     assert data["fits"][-1]["chi2_per_dof"] is None
-    assert data["warnings"] == list(calibration.warnings)
+    assert data["warnings"] == [{w.name: w} for w in calibration.warnings]
 
 
 def test_yaml_says_direction_sign_and_units_at_its_top(saved: Path):

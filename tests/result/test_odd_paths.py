@@ -8,6 +8,7 @@ import os
 from pathlib import Path
 
 import pytest
+from tests.remarks import remark
 from tests.tools.allan.test_allan import at_rest
 
 from icalib.base.files import printable
@@ -23,7 +24,10 @@ ODD = os.fsdecode(b"B\xfcro")
 @pytest.fixture(scope="module")
 def odd(calibration: Calibration) -> Calibration:
     return dataclasses.replace(
-        calibration, inputs={f"/{ODD}/rig.yaml": "0" * 64}, notes=(f"/{ODD}/rec: left out.",), warnings=(ODD,)
+        calibration,
+        inputs={f"/{ODD}/rig.yaml": "0" * 64},
+        notes=(remark(f"/{ODD}/rec: left out."),),
+        warnings=(remark(ODD),),
     )
 
 

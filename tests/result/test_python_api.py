@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from tests.remarks import remark
 
 import icalib
 from icalib.geometry import so3
@@ -58,7 +59,7 @@ class Cells(HTMLParser):
 
 
 def test_notebooks_show_the_same_as_html(robot: Calibration):
-    sharp = dataclasses.replace(robot, warnings=("cam0 < cam1 & more.",))
+    sharp = dataclasses.replace(robot, warnings=(remark("cam0 < cam1 & more."),))
     found = Cells(sharp._repr_html_())
     assert found.open == [] and found.texts[0] == f"Verdict: {sharp.verdict}"
     assert "cam0 < cam1 & more." in found.texts and "unobservable" in found.texts

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from tests.remarks import remark
 
 from icalib.cli import main
 from icalib.cli.console import print_result, print_warnings
@@ -19,6 +20,8 @@ from icalib.result import Calibration, load_calibration, relative_pose, verdict
 from icalib.result.quantities import rows
 from icalib.result.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
 from icalib.sensors.imu.spec import class_imperfections
+
+LARGE = remark("it is too large.")
 
 
 def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> Calibration:
@@ -36,13 +39,13 @@ def with_verdicts(c: Calibration, verdict: str, where: tuple[str, ...] = ()) -> 
 def cases(calibration: Calibration) -> dict[str, Calibration]:
     """By name; each name begins with the verdict."""
     sound = with_verdicts(calibration, "determined")
-    wrong = {"warnings": ("mind.", "it is too large."), "wrong": ("it is too large.",)}
+    wrong = {"warnings": (remark("mind."), LARGE), "wrong": (LARGE,)}
     return {
         "usable": sound,
         "usable: coefficients trade, the projection is known": with_verdicts(calibration, "weak", ("distortion",)),
         "usable: nuisances": with_verdicts(calibration, "unobservable", ("bloom", "shape", "tilt")),
         "usable with care: weak": with_verdicts(calibration, "weak", ("translation",)),
-        "usable with care: warned": dataclasses.replace(sound, warnings=("mind.",)),
+        "usable with care: warned": dataclasses.replace(sound, warnings=(remark("mind."),)),
         "partly usable: open": with_verdicts(calibration, "unobservable", ("translation",)),
         "partly usable: too uncertain": with_verdicts(calibration, "too uncertain", ("translation",)),
         "partly usable": calibration,
@@ -73,7 +76,7 @@ def test_a_long_output_begins_with_verdict_and_first_reason(cases: dict[str, Cal
 def test_single_coefficients_of_a_lens_come_after_its_projection(calibration: Calibration):
     """Its verdict is that of the projection."""
     weak = with_verdicts(calibration, "weak", ("translation",))
-    c = dataclasses.replace(weak, unobservable=("cam0 intrinsics fx: ...",))
+    c = dataclasses.replace(weak, unobservable=(remark("cam0 intrinsics fx: ..."),))
     assert c.verdict == "usable with care"
     assert "weakly determined" in c.reasons[-2] and c.reasons[-1] == "cam0 intrinsics fx: ..."
 
@@ -87,9 +90,10 @@ def test_every_place_says_the_same(cases: dict[str, Calibration], tmp_path: Path
     for name, c in cases.items():
         folder = tmp_path / str(len(name))
         c.save(folder)
-        for file, load in (("calibration.yaml", yaml.safe_load), ("result.json", json.loads)):
-            data = load((folder / file).read_text())
-            assert (data["verdict"], tuple(data["reasons"])) == (c.verdict, c.reasons)
+        read, named = json.loads((folder / "result.json").read_text()), [{r.name: r} for r in c.reasons]
+        assert (read["verdict"], tuple(read["reasons"])) == (c.verdict, c.reasons)
+        read = yaml.safe_load((folder / "calibration.yaml").read_text())
+        assert (read["verdict"], read["reasons"]) == (c.verdict, named)
         again = load_calibration(folder)
         assert (again.verdict, again.reasons) == (c.verdict, c.reasons)
         assert console_of(c).endswith(f"Verdict: {c.verdict}. {NEXT[c.verdict]}")
@@ -120,7 +124,7 @@ def test_every_component_of_a_bad_verdict_is_in_the_reasons(calibration: Calibra
         dataclasses.replace(g, verdict=(verdicts[g.name],) * len(g.verdict)) if g.name in verdicts else g
         for g in calibration.groups
     )
-    directions = ("cam0 rotation x with cam1 rotation x: not determined by this motion; turn.",)
+    directions = (remark("cam0 rotation x with cam1 rotation x: not determined by this motion; turn."),)
     found = dataclasses.replace(calibration, groups=groups, unobservable=directions, warnings=())
     direction, rest, uncertain, weak = found.reasons
     assert direction == directions[0] and "cam0 rotation x" not in rest and "cam0 rotation y" in rest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from tests.remarks import remark
 
 from icalib.observability.assessor import Cause
 from icalib.result import SensorFit
@@ -15,14 +16,16 @@ def fits(*ratios: float) -> list[SensorFit]:
 
 
 def test_the_largest_gain_comes_first_and_ties_keep_their_order():
-    causes = [Cause("a", 1.0), Cause("b", 9.0), Cause("c", 1.0), Cause("d", np.inf)]
+    causes = [Cause(remark("a"), 1.0), Cause(remark("b"), 9.0), Cause(remark("c"), 1.0), Cause(remark("d"), np.inf)]
     assert [c.sentence for c in ranked(causes)] == ["d", "b", "a", "c"]
 
 
 def test_a_cause_explains_a_misfit_by_its_gain_alone():
     misfit = Misfit.of(fits(1.0, 5.0))
     assert misfit.sensors == {"imu1"} and misfit.chi2 == 3600.0
-    assert explaining([Cause("a", 361.0)], misfit) and not explaining([Cause("a", 359.0), Cause("b", 10.0)], misfit)
+    assert explaining([Cause(remark("a"), 361.0)], misfit) and not explaining(
+        [Cause(remark("a"), 359.0), Cause(remark("b"), 10.0)], misfit
+    )
     assert not explaining([], misfit)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from icalib.base.extras import load_typesys, load_zstd
 from icalib.base.files import unpacked
+from icalib.base.remark import Remark
 from icalib.data.bags import ZSTD_MAGIC, Tally, open_storages
 from icalib.data.images import Payload, checked_payloads, file_payload
 from icalib.data.messages import MessageType, TopicInfo, choose_topic, find_topic, message_types
@@ -82,7 +83,7 @@ class BagRecording(Recording):
     def files(self) -> list[Path]:
         return [*(storage.name for storage in self._storages), *super().files()]
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Remark, ...]:
         damage = (note for storage in self._storages for note in storage.notes)
         return tuple(dict.fromkeys([*self._notes, *damage]))
 
@@ -120,10 +121,11 @@ class BagRecording(Recording):
         if damaged:
             self._note_damage(topic.name, damaged, total)
         if unstamped:
-            self.note(
+            sentence = (
                 f"{self.root} {topic.name}: {unstamped} messages have no stamp in their header. Their receive "
                 "times are used instead, which are late and jittery; let the driver stamp each message."
             )
+            self.note(Remark("messages_without_stamp", sentence))
 
     def _note_damage(self, topic: str, damaged: list[tuple[int, ValueError]], total: int) -> None:
         """Note on `damaged` messages (receive time [ns], error). Raises RecordingError if all `total` are damaged."""
@@ -134,10 +136,11 @@ class BagRecording(Recording):
                 f"{self.root} {topic}: the message received at {first_ns} ns is damaged ({error}){others}; copy or "
                 "record the bag again."
             ) from error
-        self.note(
+        sentence = (
             f"{self.root} {topic}: {len(damaged)} of {total} messages are damaged and were left out, the first "
             f"received at {first_ns} ns ({error})."
         )
+        self.note(Remark("messages_damaged", sentence))
 
     def _contents(self, topic: TopicInfo) -> Iterator[tuple[int, str, bytes]]:
         """Receive time [ns], encoding and bytes of each message in the window, and of latched messages
@@ -163,10 +166,11 @@ class BagRecording(Recording):
         late_ns = int((np.maximum.accumulate(stamps_ns) - stamps_ns).max()) if back.any() else 0
         if not 0 < late_ns <= _SWAPPED_NS:
             return np.arange(len(stamps_ns))
-        self.note(
+        sentence = (
             f"{self.root} {topic}: {int(back.sum())} readings are out of order by up to {late_ns * 1e-6:.1f} "
             "ms; all were sorted by stamp."
         )
+        self.note(Remark("readings_out_of_order", sentence))
         return np.argsort(stamps_ns, kind="stable")
 
     def _list_topics(self) -> tuple[TopicInfo, ...]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from icalib.base.extras import load_lz4, load_zstd
 from icalib.base.files import HEAD_BYTES, HashedFile, TooLargeError, copy_unpacked, hash_of, not_data, regular, unpacked
+from icalib.base.remark import Remark
 from icalib.base.yaml_nodes import read_yaml
 from icalib.errors import RecordingError, RigError
 
@@ -62,7 +63,7 @@ class Storage(Protocol):
 
     name: Path  # for messages; the file that is read may be an unpacked copy
     connections: dict[int, Connection]
-    notes: list[str]
+    notes: list[Remark]
 
     def tally(self) -> dict[int, Tally]:
         """Number and receive times of messages by connection id."""
@@ -82,7 +83,7 @@ def full_type(name: str) -> str:
     return name if "/" in message or not message else f"{package}/msg/{message}"
 
 
-def cut_note(name: Path, where: str, tally: dict[int, Tally]) -> str:
+def cut_note(name: Path, where: str, tally: dict[int, Tally]) -> Remark:
     """Note on a file that can be read only before the position `where`. Raises RecordingError if `tally` is empty."""
     count = sum(t.count for t in tally.values())
     if not count:
@@ -90,7 +91,10 @@ def cut_note(name: Path, where: str, tally: dict[int, Tally]) -> str:
             f"{name} is truncated or damaged {where}, before its first message; copy or record it again."
         )
     span = max(t.last_ns for t in tally.values()) - min(t.first_ns for t in tally.values())
-    return f"{name} is truncated or damaged {where}; the readable part is used: {count} messages, {span * 1e-9:.1f} s."
+    return Remark(
+        "bag_truncated",
+        f"{name} is truncated or damaged {where}; the readable part is used: {count} messages, {span * 1e-9:.1f} s.",
+    )
 
 
 class _UnknownCompressionError(Exception):
@@ -124,7 +128,7 @@ class SpanStorage(ABC):
         self.path = path
         self.name = name
         self.connections: dict[int, Connection] = {}
-        self.notes: list[str] = []
+        self.notes: list[Remark] = []
         self._hash = hash_of(path)
         self.spans: list[Span] = []
         with path.open("rb") as file:
@@ -178,7 +182,7 @@ class SpanStorage(ABC):
         except (DamageError, TooLargeError) as error:
             large = isinstance(error, TooLargeError)
             what = f"is ignored: {error}." if large else "is damaged; the messages after the damage were ignored."
-            note = f"{self.name}: the block at byte {span.offset} {what}"
+            note = Remark("bag_block_damaged", f"{self.name}: the block at byte {span.offset} {what}")
             if not span.cut and note not in self.notes:
                 self.notes.append(note)
 
@@ -359,7 +363,7 @@ class SqliteStorage:
     def __init__(self, path: Path, name: Path) -> None:
         self.path = path
         self.name = name
-        self.notes: list[str] = []
+        self.notes: list[Remark] = []
         self._tally: dict[int, Tally] = {}
         self._last_id = -1  # id of the last usable message
         try:
@@ -383,7 +387,8 @@ class SqliteStorage:
             try:
                 yield from database.execute(query, (self._last_id, *wanted))
             except sqlite3.DatabaseError as error:
-                note = f"{self.name} is damaged ({error}); the messages after the damage were ignored."
+                sentence = f"{self.name} is damaged ({error}); the messages after the damage were ignored."
+                note = Remark("bag_damaged", sentence)
                 if note not in self.notes:
                     self.notes.append(note)
 
@@ -570,7 +575,7 @@ def bag_files(folder: Path) -> list[Path]:
     return sorted(paths, key=lambda p: [int(t) if t.isdigit() else t for t in re.split(r"(\d+)", p.name)])
 
 
-def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
+def open_storages(path: Path) -> tuple[list[Storage], list[Remark]]:
     """Readers of the bag file or folder `path`, and notes on missing and unreadable files of a folder.
 
     Raises RecordingError if no file can be read.
@@ -578,7 +583,10 @@ def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
     if not path.is_dir():
         return [open_storage(path)], []
     files = bag_files(path)
-    notes = [f"{path}: metadata.yaml lists {name}, which does not exist." for name in _absent(path)]
+    notes = [
+        Remark("bag_file_missing", f"{path}: metadata.yaml lists {name}, which does not exist.")
+        for name in _absent(path)
+    ]
     storages: list[Storage] = []
     for file in files:
         try:
@@ -586,7 +594,7 @@ def open_storages(path: Path) -> tuple[list[Storage], list[str]]:
         except RecordingError as error:
             if len(files) == 1:
                 raise
-            notes.append(str(error))
+            notes.append(Remark("bag_file_unreadable", str(error)))
     if not storages:
         raise RecordingError(f"{path}: none of its {len(files)} bag files can be read. {notes[-1]}")
     return storages, notes

@@ -13,6 +13,7 @@ from typing import final
 import numpy as np
 
 from icalib.base.files import VIDEO_FILE
+from icalib.base.remark import Remark
 from icalib.data.images import (
     SUFFIXES,
     Note,
@@ -120,7 +121,8 @@ class FolderRecording(Recording):
         if (table := stamp_table(video)) is not None:
             self._remember(table)
             if table.stem != video.stem:
-                self.note(f"{video}: its frames have the stamps of {table.name}, a table with as many rows.")
+                sentence = f"{video}: its frames have the stamps of {table.name}, a table with as many rows."
+                self.note(Remark("video_stamps_from_table", sentence))
         frames = video_payloads(video, str(video))
         if not self.window.is_all:
             stamps_ns = video_stamps(video)

@@ -17,6 +17,7 @@ import numpy as np
 
 from icalib.base.extras import load_cv2
 from icalib.base.files import HEAD_BYTES, VIDEO_FILE, hash_of, is_video, most_bytes, not_data, regular
+from icalib.base.remark import Remark
 from icalib.data.messages import TopicInfo
 from icalib.data.stamps import is_rate, nanoseconds, unit_by_date, unit_of_stamps
 from icalib.errors import RecordingError
@@ -252,13 +253,13 @@ _ENCODINGS: dict[str, tuple[int, Convert]] = {  # bytes per pixel, conversion of
 
 # Checks of image streams: one camera, ordered stamps, no frozen images. Rejected images are counted in notes.
 
-Note = Callable[[str], None]
+Note = Callable[[Remark], None]
 LOOK_AHEAD = 5  # number of first images; their most frequent resolution is that of the camera
 ODD, ODD_SHARE = 2, 0.1  # tolerated images of another resolution, as number or share; more: several cameras
 _LATE_NS = 1_000_000_000  # an image late by more means that the clock was set back
 
 
-def ignore(sentence: str) -> None:
+def ignore(sentence: Remark) -> None:
     """A `Note` that discards the sentence."""
 
 
@@ -282,7 +283,9 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
             error = _other_size(payload, size, where)
             if odd > max(ODD, ODD_SHARE * kept):
                 raise RecordingError(error)
-            dropped.add(f"have another size than {size[0]} x {size[1]} px", payload, error)
+            dropped.add(
+                Remark("images_of_other_size", f"have another size than {size[0]} x {size[1]} px"), payload, error
+            )
             continue
         if last is not None and (reason := _does_not_follow(last, payload, where)):
             dropped.add(reason, payload)
@@ -296,25 +299,27 @@ def checked_payloads(payloads: Iterable[Payload], where: str, note: Note) -> Ite
     dropped.note(where, note)
 
 
-def _content_fault(payload: Payload) -> tuple[str, str] | None:
+def _content_fault(payload: Payload) -> tuple[Remark, str] | None:
     """Reason to reject a payload without image content, and the error message in case no image remains; None for an
     image. Raises RecordingError for an unknown encoding."""
     if not np.frombuffer(payload.data, np.uint8).any():
-        return "consist of zeros", ""
+        return Remark("images_of_zeros", "consist of zeros"), ""
     if payload.encoding == NO_PICTURE:
-        return "are not images", unknown_encoding(payload)
+        return Remark("messages_without_image", "are not images"), unknown_encoding(payload)
     if not is_known(payload.encoding):
         raise RecordingError(unknown_encoding(payload))
     return None
 
 
-def _does_not_follow(last: Payload, payload: Payload, where: str) -> str:
-    """Reason to reject an image that follows the image `last`; empty if there is none. Raises RecordingError if the
+def _does_not_follow(last: Payload, payload: Payload, where: str) -> Remark | None:
+    """Reason to reject an image that follows the image `last`; None if there is none. Raises RecordingError if the
     clock was set back."""
     _refuse_other_clock(last, payload, where)
     if payload.stamp_ns <= last.stamp_ns:
-        return "are not later than their predecessor"
-    return "repeat their predecessor exactly (the camera froze)" if payload.data == last.data else ""
+        return Remark("images_out_of_order", "are not later than their predecessor")
+    if payload.data != last.data:
+        return None
+    return Remark("camera_frozen", "repeat their predecessor exactly (the camera froze)")
 
 
 def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[DecodedImage]:
@@ -328,7 +333,7 @@ def frames(payloads: Iterable[Payload], where: str, note: Note) -> Iterator[Deco
         try:
             image = decode(payload)
         except DamagedImageError as error:
-            dropped.add("are damaged", payload, str(error))
+            dropped.add(Remark("frames_damaged", "are damaged"), payload, str(error))
             continue
         kept += 1
         yield DecodedImage(payload.stamp_ns, image)
@@ -341,18 +346,19 @@ class _Dropped:
     """Rejected images by reason: their number, the first image, and the first error message."""
 
     def __init__(self) -> None:
-        self.count: dict[str, int] = {}
+        self.count: dict[Remark, int] = {}
         self._first: dict[str, str] = {}
         self.first_error = ""
 
-    def add(self, reason: str, payload: Payload, error: str = "") -> None:
+    def add(self, reason: Remark, payload: Payload, error: str = "") -> None:
         self.count[reason] = self.count.get(reason, 0) + 1
         self._first.setdefault(reason, payload.which)
         self.first_error = self.first_error or error
 
     def note(self, where: str, note: Note) -> None:
         for reason, count in self.count.items():
-            note(f"{where}: {count} images that {reason} were left out, the first {self._first[reason]}.")
+            sentence = f"{where}: {count} images that {reason} were left out, the first {self._first[reason]}."
+            note(reason.saying(sentence))
 
 
 def _usual_size(payloads: Iterable[Payload]) -> tuple[tuple[int, int], Iterator[Payload]]:
@@ -448,10 +454,11 @@ def are_most(named: Sequence[Path], files: Sequence[Path], note: Note = ignore) 
     a note."""
     odd = sorted(set(files) - set(named))
     if odd and len(named) > len(odd):
-        note(
-            f"{odd[0].parent}: {len(odd)} of {len(files)} images were left out, the first {odd[0].name}: its name has "
-            "neither a number nor a stamp since 1970, as the others have."
+        sentence = (
+            f"{odd[0].parent}: {len(odd)} of {len(files)} images were left out, the first {odd[0].name}: its name "
+            "has neither a number nor a stamp since 1970, as the others have."
         )
+        note(Remark("images_without_number", sentence))
     return len(named) > len(odd)
 
 
@@ -476,9 +483,13 @@ def file_payloads(files: list[tuple[int, Path]], where: str, note: Note) -> Iter
     if pointers:
         if len(pointers) + len(missing) == len(files):
             raise RecordingError(pointers[0])
-        note(f"{where}: {len(pointers)} of {len(files)} images cannot be read, the first: {pointers[0]}")
+        sentence = f"{where}: {len(pointers)} of {len(files)} images cannot be read, the first: {pointers[0]}"
+        note(Remark("images_not_downloaded", sentence))
     if missing:
-        note(f"{where}: {len(missing)} of {len(files)} images are missing or empty, the first is {missing[0].name}.")
+        sentence = (
+            f"{where}: {len(missing)} of {len(files)} images are missing or empty, the first is {missing[0].name}."
+        )
+        note(Remark("images_missing", sentence))
 
 
 def _listed(table: Path, data: Path) -> list[tuple[int, Path]]:
@@ -534,7 +545,8 @@ def _with_other_endings(
         raise RecordingError(
             f"{names}: none of its {len(listed)} images is there; correct the names, or copy the images."
         )
-    note(f"{names}: {same} images were found under the same name with another ending.")
+    sentence = f"{names}: {same} images were found under the same name with another ending."
+    note(Remark("images_with_other_endings", sentence))
     return renamed
 
 

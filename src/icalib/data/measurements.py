@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+from icalib.base.remark import Remark
 from icalib.errors import RecordingError
 from icalib.rig import Rig
 from icalib.sensors import SENSOR_KINDS
@@ -44,16 +45,16 @@ class Measurements:
     """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     name: str = ""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Remark, ...] = ()
 
     def __post_init__(self) -> None:
         ordered = sorted(self.streams.items(), key=lambda item: SENSOR_KINDS.index(item[1].sensor_type))
         object.__setattr__(self, "streams", dict(ordered))
 
     @classmethod
-    def of_streams(cls, *streams: Stream, notes: tuple[str, ...] = (), name: str = "") -> Measurements:
+    def of_streams(cls, *streams: Stream, notes: tuple[Remark, ...] = (), name: str = "") -> Measurements:
         """Measurements of these streams. Raises RecordingError if two streams have the same key."""
         by_key = {s.key: s for s in streams}
         if len(by_key) < len(streams):
@@ -151,6 +152,13 @@ def streams_of_rig(rig: Rig, measurements: Measurements) -> Measurements:
     return _near_origin(rig, replace(m, streams=ordered))
 
 
+def far_origin_note(what: str, origin: Iterable[float]) -> Remark:
+    """A note on positions that are relative to `origin` (3,) [m] of their frame."""
+    x, y, z = origin
+    where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
+    return Remark("positions_far_from_origin", f"{what}: positions are relative to {where}.")
+
+
 def _near_origin(rig: Rig, measurements: Measurements) -> Measurements:
     """The measurements with positions near the origin of their frame. Sensors that share a frame are shifted
     together."""
@@ -163,9 +171,7 @@ def _near_origin(rig: Rig, measurements: Measurements) -> Measurements:
         if origin is None:
             continue
         streams[key] = stream.relative_to(origin)
-        x, y, z = origin
-        where = f"({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away"
-        notes += (f"{stream.name}: positions are relative to {where}.",)
+        notes += (far_origin_note(stream.name, origin),)
     return replace(measurements, streams=streams, notes=notes)
 
 
@@ -245,7 +251,8 @@ def _length_ns(rig: Rig, measurements: Measurements) -> int:
 
 def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measurements:
     notes, warnings = (
-        tuple(f"{m.name}: {words}" for m in recordings for words in getattr(m, kind)) for kind in ("notes", "warnings")
+        tuple(words.saying(f"{m.name}: {words}") for m in recordings for words in getattr(m, kind))
+        for kind in ("notes", "warnings")
     )
     disjoint = _disjoint(recordings)
     streams = {k: type(s).joined([by_key[k] for by_key in disjoint], shifts) for k, s in disjoint[0].items()}

@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.images import DecodedImage, Payload, frames
 from icalib.data.messages import MessageType, TopicInfo, UnreadType, choose_topic
 from icalib.data.stamps import WHOLE_RECORDING, S, Span, Window, cut, stamps_inside
@@ -40,7 +41,7 @@ class Recording(ABC):
         self.root = root
         self.window = window
         self._read: list[Path] = []
-        self._notes: list[str] = []
+        self._notes: list[Remark] = []
         self._sensors: tuple[Sensor, ...] = ()
 
     @abstractmethod
@@ -132,12 +133,12 @@ class Recording(ABC):
         """Files read so far, without duplicates, in the order of reading."""
         return list(self._read)
 
-    def note(self, sentence: str) -> None:
+    def note(self, sentence: Remark) -> None:
         """Add a sentence on rejected or repaired data to `notes()`, without duplicates."""
         if sentence not in self._notes:
             self._notes.append(sentence)
 
-    def notes(self) -> tuple[str, ...]:
+    def notes(self) -> tuple[Remark, ...]:
         """Sentences on data that were rejected or repaired so far."""
         return tuple(self._notes)
 
@@ -154,7 +155,7 @@ class Recording(ABC):
         return stamps_inside(self.window, stamps_ns, where, self._spans())
 
 
-ReadStream = tuple[Stream, tuple[str, ...]]  # stream, notes on it
+ReadStream = tuple[Stream, tuple[Remark, ...]]  # stream, notes on it
 Progress = Callable[[str, float], None]  # called with the stage and the completed fraction, 0 to 1
 
 

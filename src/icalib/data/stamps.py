@@ -13,6 +13,7 @@ from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.errors import RecordingError
 from icalib.geometry import so3
 from icalib.rig import TimeUnit
@@ -25,7 +26,7 @@ _MOST_DOUBTFUL, _LEAST_LEFT = 0.1, 3  # largest tolerated share of conflicts; le
 
 def kept_readings(
     stamps_ns: np.ndarray, values: np.ndarray, what: str, rate_hz: tuple[float, float], noun: str, remedy: str
-) -> tuple[np.ndarray, tuple[str, ...]]:
+) -> tuple[np.ndarray, tuple[Remark, ...]]:
     """(N,) bool: readings to keep, of stamps_ns (N,) and values (N, m); and notes on the rejected ones.
 
     Rejected are exact repetitions, and all readings that share a stamp but differ in value. what, noun, remedy: words
@@ -49,14 +50,21 @@ def kept_readings(
     _refuse_many(differs, stamps_ns, what, noun, remedy)
     notes = ()
     if differs.any():
-        notes += (
+        note = Remark(
+            "readings_share_stamps",
             f"{what}: {int(differs.sum())} {plural} share a stamp with a different {noun}. Which one is right "
             f"is unknown, so all of them were removed, the first at {stamps_ns[np.argmax(differs)]} ns.",
         )
+        notes += (note,)
     if again.any():
         first = stamps_ns[np.argmax(again)]
-        notes += (f"{what}: {int(again.sum())} repeated {plural} were dropped, the first at {first} ns.",)
+        notes += (repeated_note(what, int(again.sum()), plural, first),)
     return ~(differs | again), notes
+
+
+def repeated_note(what: str, count: int, plural: str, first_ns: int) -> Remark:
+    """A note on readings that repeat the one before exactly. plural: word for them; first_ns: stamp of the first."""
+    return Remark("readings_repeated", f"{what}: {count} repeated {plural} were dropped, the first at {first_ns} ns.")
 
 
 def _one_stamp(stamps_ns: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +126,7 @@ class ClockJumps:
     """
 
     def __init__(self, longest_s: float = np.inf) -> None:
-        self.notes: tuple[str, ...] = ()
+        self.notes: tuple[Remark, ...] = ()
         self._longest_s = longest_s
         self._kept: dict[int, int] = {}  # which part, by how many there are
 
@@ -176,15 +184,16 @@ def _seconds(stream: Stamped, begin: int, end: int) -> float:
     return float(stream.stamps_ns[end - 1] - stream.stamps_ns[begin]) * 1e-9
 
 
-def _note(stream: Stamped, what: str, cuts: Sequence[int], kept: tuple[int, int]) -> str:
+def _note(stream: Stamped, what: str, cuts: Sequence[int], kept: tuple[int, int]) -> Remark:
     stamps = stream.stamps_ns
     jump = cuts[1]
     more = f" (and {len(cuts) - 3} more times)" if len(cuts) > 3 else ""
-    return (
+    return Remark(
+        "recording_clock_jumps",
         f"{what}: the clock jumps forward by {_seconds(stream, jump - 1, jump + 1):.6g} s{more} after the "
         f"stamp {stamps[jump - 1]} ns, {_seconds(stream, 0, jump):.6g} s from the start. Only the "
         f"{_seconds(stream, *kept):.6g} s from {stamps[kept[0]]} ns on are used; choose another part with "
-        "--from and --to."
+        "--from and --to.",
     )
 
 
@@ -291,13 +300,14 @@ class EvenStamps:
     jitter_s: float
     left_s: float
 
-    def note(self, what: str, noun: str) -> str:
+    def note(self, what: str, noun: str) -> Remark:
         """A sentence for the user. what: the source; noun: what is stamped, in the plural."""
         how = f"come in bursts of {self.burst}" if self.burst > 1 else f"jitter by {self.jitter_s * 1e3:.2g} ms"
-        return (
+        return Remark(
+            "stamps_jitter",
             f"{what}: the stamps {how} (up to {self.latest_s * 1e3:.3g} ms late), although the {noun} are evenly "
             f"spaced. They were made even at {1e9 / self.period_ns:.2f} Hz; let the device or its driver stamp the "
-            f"{noun}."
+            f"{noun}.",
         )
 
 
@@ -523,9 +533,9 @@ class Window:
         end = origin_ns + round(self.end_s * 1e9) if self.end_s < inf else 2**63 - 1
         return origin_ns + round(self.start_s * 1e9), min(end, 2**63 - 1)
 
-    def note(self, where: str) -> str:
+    def note(self, where: str) -> Remark:
         end = f"to {self.end_s:g} s" if self.end_s < inf else "on"
-        return f"{where}: only the part from {self.start_s:g} s after its start {end} is used."
+        return Remark("recording_cut", f"{where}: only the part from {self.start_s:g} s after its start {end} is used.")
 
     def refuse(self, what: str, length_s: float) -> RecordingError:
         """The error for a window without data. length_s: length of the data from the start of the recording."""

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.base.files import HEAD_BYTES, TooLargeError, gunzipped, hash_of, not_data, regular
+from icalib.base.remark import Remark
 from icalib.data.images import Note, are_most, ignore, pictures_in, stamped_by_name
 from icalib.data.stamps import POWERS_OF_NS, UNIT_WORDS, TimeUnit, is_rate, unit_of_stamps
 from icalib.data.table_kernels import LEFT_OUT, POWERS, parse
@@ -48,7 +49,7 @@ class Table:
     decimals: np.ndarray
     numbers: np.ndarray
     written: int
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -77,10 +78,11 @@ def read_table(path: Path, kind: TableKind, layout: TableLayout = PLAIN_TABLE, n
     if table is None:
         table, unit = _in_ns(text, kind, _places(text, kind, layout), layout.time_unit)
     if unit:
-        note(
-            f"{path}: the stamps are read as {UNIT_WORDS[unit]}, as their rate shows; `time_unit` in the rig file may "
-            "say otherwise."
+        sentence = (
+            f"{path}: the stamps are read as {UNIT_WORDS[unit]}, as their rate shows; `time_unit` in the rig file "
+            "may say otherwise."
         )
+        note(Remark("stamp_unit_recognised", sentence))
     falls = np.diff(table.integers[:, 0]) < 0
     if not (text.header or layout.columns) and falls.sum() > _MOST_FALLING * len(falls):
         raise RecordingError(f"{path}: its first column often falls, so it is no stamp; {_advice(kind)}.")
@@ -110,7 +112,7 @@ def _joined(text: _Text, kind: TableKind, layout: TableLayout) -> Table | None:
         )
         if good.mean() < 1.0 - _MOST_UNREADABLE:
             raise RecordingError(f"{sentence}; correct the program that writes them.")
-        notes += (f"{sentence}; they were ignored.",)
+        notes += (Remark("rows_without_stamp", f"{sentence}; they were ignored."),)
     stamps_ns = seconds[good] * _NS + rest[good]
     integers = np.column_stack([stamps_ns, table.integers[good, 2:]])
     return Table(text.path, integers, table.decimals[good], table.numbers[good], table.written, notes)
@@ -267,7 +269,7 @@ def _table(text: _Text, kind: TableKind, place: np.ndarray, power: int) -> Table
         if bad > _MOST_UNREADABLE * (rows + bad):
             raise RecordingError(sentence)
         left = "the line was left out" if bad == 1 else f"{bad} lines of {rows + bad} were left out, this is the first"
-        notes = (f"{sentence.rpartition(';')[0]}; {left}.",)
+        notes = (Remark("table_lines_unreadable", f"{sentence.rpartition(';')[0]}; {left}."),)
     return Table(text.path, integers[:rows], decimals[:rows], numbers[:rows], rows + bad, notes)
 
 
@@ -315,7 +317,7 @@ def _describe(text: _Text, kind: TableKind, line: int, place: np.ndarray, column
     return f"{spot}: {name} is {excerpt!r}, which is not written as a plain decimal number; correct the line."
 
 
-StampsOfRows = Callable[[Path, TableLayout, Callable[[str], None]], tuple[dict[int, int], int]]
+StampsOfRows = Callable[[Path, TableLayout, Note], tuple[dict[int, int], int]]
 
 
 @dataclass(frozen=True)
@@ -559,17 +561,19 @@ def stamped_by_rows(
             f"has {count} rows; number each image as the row of its pose, or use stamps as file names."
         )
     how = "in order" if in_order else f"by number, {first} being that of the first row"
-    note(
+    sentence = (
         f"{folder}: {len(images)} images have no timestamps. Each takes that of its row of {table}, {how}: "
         f"image {images[0][1].name} belongs to row {rows[0] + 1}."
     )
+    note(Remark("images_stamped_by_rows", sentence))
     paths = [path for _, path in images]
     lost = [path for row, path in zip(rows, paths, strict=True) if row not in stamp_of]
     if lost:
-        note(
+        sentence = (
             f"{folder}: {len(lost)} of {len(images)} images are ignored, the first is {lost[0].name}: the row "
             f"of its pose in {table} cannot be read."
         )
+        note(Remark("images_of_unreadable_rows", sentence))
     return [(stamp_of[row], path) for row, path in zip(rows, paths, strict=True) if row in stamp_of]
 
 

@@ -25,6 +25,7 @@ import numpy as np
 
 from icalib.base.extras import load_cv2
 from icalib.base.files import load_arrays, staged
+from icalib.base.remark import Remark
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.detection.decoding import KEPT, VERDICTS, ImageCorners
 from icalib.geometry.targets import Markers, Scene, Target
@@ -74,12 +75,12 @@ def spread_images(recording: Recording, topic: str) -> Iterator[np.ndarray]:
             yield decode(payload)
 
 
-def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tuple[str, ...]:
+def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tuple[Remark, ...]:
     """A sentence on damaged images with these stamps; empty without any. files: names by stamp."""
     if not len(damaged_ns):
         return ()
     first = which_image(files.get(damaged_ns[0], ""), damaged_ns[0])
-    return (f"{len(damaged_ns)} damaged images were ignored, the first {first}.",)
+    return (Remark("images_damaged", f"{len(damaged_ns)} damaged images were ignored, the first {first}."),)
 
 
 def core_count() -> int:
@@ -199,7 +200,7 @@ def n_images_with(images: list[ImageCorners], part: Part) -> int:
     return sum(bool((i.kept & (i.point >= first) & (i.point < first + len(target.points))).any()) for i in images)
 
 
-def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[ImageCorners], tuple[str, ...]]:
+def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[ImageCorners], tuple[Remark, ...]]:
     """The images without free tags that fewer than LEAST_IMAGES or LEAST_IMAGE_SHARE of them show, and sentences that
     name these tags.
 
@@ -207,7 +208,7 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
     kept.
     """
     least = max(LEAST_IMAGES, ceil(LEAST_IMAGE_SHARE * len(images)))
-    notes: list[str] = []
+    notes: list[Remark] = []
     for name, part, first in parts_of(target):
         if not isinstance(part, Markers) or part.ids:
             continue
@@ -220,10 +221,11 @@ def without_rare_tags(target: Target, images: list[ImageCorners]) -> tuple[list[
             continue
         images = [_without(i, first, rare) for i in images]
         ids = ", ".join(str(k) for k in part.known[rare[:_MOST_IDS]]) + (", ..." if len(rare) > _MOST_IDS else "")
-        notes.append(
+        sentence = (
             f"{len(rare)} tags of {part.family} (ids {ids}) are in fewer than {least} of {len(images)} images "
             f"and were ignored; list the ids{' of ' + name if name else ''} in the rig file if they exist."
         )
+        notes.append(Remark("tags_seen_rarely", sentence))
     return images, tuple(notes)
 
 
@@ -233,7 +235,7 @@ def _without(image: ImageCorners, first: int, tags: np.ndarray) -> ImageCorners:
     return ImageCorners(*(getattr(image, f.name)[rows] for f in dataclasses.fields(image)))
 
 
-def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
+def sightings(target: Target, images: list[ImageCorners]) -> tuple[Remark, ...]:
     """Sentences: how many images show each target, how many corners were dropped and why, and which targets are never
     seen."""
     kept = sum(int(i.kept.sum()) for i in images)
@@ -243,8 +245,12 @@ def sightings(target: Target, images: list[ImageCorners]) -> tuple[str, ...]:
     counts = {part[0] or "the target": n_images_with(images, part) for part in parts_of(target)}
     words = ", ".join(f"{name} is in {n}" for name, n in counts.items())
     missing = " and ".join(name for name, n in counts.items() if not n)
-    notes = (f"{words} of {len(images)} images, {kept} corners{tail}.",)
-    return (*notes, f"{missing} is never seen; check its type, family, ids and sizes.") if missing else notes
+    notes = (Remark("target_sightings", f"{words} of {len(images)} images, {kept} corners{tail}."),)
+    return (
+        (*notes, Remark("target_never_seen", f"{missing} is never seen; check its type, family, ids and sizes."))
+        if missing
+        else notes
+    )
 
 
 def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[ImageCorners]:

@@ -71,6 +71,7 @@ def plain_json(c: Calibration) -> Export:
         }
     }
     data |= yaml.safe_load(calibration_yaml(c))
+    data |= {name: list(getattr(c, name)) for name in ("reasons", "unobservable", "warnings", "notes")}
     for sensor in data["sensors"].values():
         T = np.array(sensor[key])
         sensor |= {"quaternion_xyzw": list(quaternion(T[:3, :3])), "translation": T[:3, 3].tolist()}

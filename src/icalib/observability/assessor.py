@@ -8,6 +8,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Segments
@@ -21,8 +22,7 @@ from icalib.sensors.stream import Residuals
 
 S = TypeVar("S", bound=Sensor)
 Groups = Mapping[Key, ParameterGroup]
-Sentences = Iterable[str]
-Keyed = Iterable[tuple[str, np.ndarray]]  # each with a sentence or the key of a stream
+Remarks = Iterable[Remark]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Cause:
     grave: whether the result must not be used; explains: parameter groups whose stated values contradict the data for
     this cause, so that the contradiction needs no other sentence."""
 
-    sentence: str
+    sentence: Remark
     gain: float
     grave: bool = False
     explains: tuple[Key, ...] = ()
@@ -74,15 +74,15 @@ class Assessment:
 
     residuals: Iterable[Residuals] | None = None
     planes: Iterable[Plane] = ()
-    notes: Sentences = ()
-    ambiguities: Sentences = ()
-    warnings: Sentences = ()
-    value_warnings: Sentences = ()
+    notes: Remarks = ()
+    ambiguities: Remarks = ()
+    warnings: Remarks = ()
+    value_warnings: Remarks = ()
     causes: Iterable[Cause] = ()
     clock_causes: Iterable[Cause] = ()
     unreliable: Iterable[str] = ()
-    many_rejected: Sentences = ()
-    overstated_noise: Sentences = ()
+    many_rejected: Remarks = ()
+    overstated_noise: Remarks = ()
 
 
 @dataclass(frozen=True)
@@ -100,12 +100,14 @@ class Assessor(Generic[S]):
     """
 
     assess: Callable[[AssessedEstimate], Assessment]
-    misfit: Callable[[S, SensorFit, bool], str | None]
-    keyframe_instants: Callable[[Inputs, State], Keyed] = lambda *_: ()
-    inner_contradictions: Callable[[Inputs, Estimate, Segments | None], Keyed] = lambda *_: ()
+    misfit: Callable[[S, SensorFit, bool], Remark | None]
+    keyframe_instants: Callable[[Inputs, State], Iterable[tuple[str, np.ndarray]]] = lambda *_: ()
+    inner_contradictions: Callable[[Inputs, Estimate, Segments | None], Iterable[tuple[Remark | None, np.ndarray]]] = (
+        lambda *_: ()
+    )
     length: Callable[[S, Rig], str | None] = lambda *_: None
     sizes: Callable[[S], Sequence[str]] = lambda _: ()
-    absurd: Callable[[S, Groups], Sentences] = lambda *_: ()
+    absurd: Callable[[S, Groups], Remarks] = lambda *_: ()
     is_far_guess: Callable[[S, str, Groups], bool | None] = lambda *_: None
     looks_like: Callable[[S, str, np.ndarray, np.ndarray], str] = lambda *_: ""
 

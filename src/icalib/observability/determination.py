@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, eigh, qr
 
+from icalib.base.remark import Remark
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import EARLY_PASS, NO_CALLBACKS, Callbacks, Estimate, EstimateOptions, estimate
 from icalib.estimate.inputs import Inputs
@@ -370,7 +371,7 @@ class Observability:
     """
 
     covariance: np.ndarray
-    unobservable: tuple[str, ...]
+    unobservable: tuple[Remark, ...]
     spread: np.ndarray
     in_null_space: np.ndarray
     by_guess: np.ndarray
@@ -404,7 +405,7 @@ def observe(
         spec = specs[first]
         motion = _missing_motion(spec, on_wheels, has_target).format(axes=axes or EVERY_AXIS)
         by = "these images" if spec.by_images else "this motion"
-        sentences.append(f"{words}: not determined by {by}; {motion}.")
+        sentences.append(Remark("combination_unobservable", f"{words}: not determined by {by}; {motion}."))
     return Observability(determined.covariance, tuple(sentences), spread, in_null_space(directions), by_guess > by_data)
 
 

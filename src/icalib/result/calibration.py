@@ -15,9 +15,10 @@ import numpy as np
 
 from icalib.base.extras import load_pandas
 from icalib.base.files import hash_of
+from icalib.base.remark import Remark
 from icalib.data.measurements import Part
 from icalib.motion.factor import ResidualRows
-from icalib.result.verdict import Usability, lens_projections_px, reasons, usability
+from icalib.result.verdict import Usability, failure_words, lens_projections_px, reasons, usability
 from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.camera.stream import CornerResiduals, ImageResiduals, TrackResiduals
@@ -133,15 +134,15 @@ class Calibration:
     covariance: np.ndarray  # (B, B) formal covariance of all estimated parameters, SI, right perturbation
     covariance_names: tuple[str, ...]  # B names: "cam0.rotation.x", ...
     null_space: np.ndarray  # (B, m) unobservable directions, orthonormal in units of the tolerances
-    unobservable: tuple[str, ...]  # one sentence each: unobservable combination and the missing motion
+    unobservable: tuple[Remark, ...]  # one sentence each: unobservable combination and the missing motion
     fits: tuple[SensorFit, ...]
     residuals: dict[tuple[str, str], Residuals]  # (sensor, kind), such as ("cam0", "corners"); see `by_key`
     trajectory: Trajectory
     iterations: tuple[Iteration, ...]
     converged: bool
     status: str  # one sentence
-    warnings: tuple[str, ...]  # one sentence each: reasons to use the result with care
-    notes: tuple[str, ...]  # what was assumed, dropped, repaired
+    warnings: tuple[Remark, ...]  # one sentence each: reasons to use the result with care
+    notes: tuple[Remark, ...]  # what was assumed, dropped, repaired
     rig: dict[str, Any] = field(default_factory=dict)  # the rig as plain data
     rates: dict[str, float] = field(default_factory=dict)  # sensor -> Hz, as recorded
     inputs: dict[str, str] = field(default_factory=dict)  # file -> sha256
@@ -152,7 +153,7 @@ class Calibration:
     recordings: tuple[RecordingSpan, ...] = ()  # in order of time; arrays of seconds cover all of them
     planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
     cross_validation: CrossValidation | None = None  # None if the recording could not be split
-    wrong: tuple[str, ...] = ()  # those of `warnings` that show an error in the rig file or the recording
+    wrong: tuple[Remark, ...] = ()  # those of `warnings` that show an error in the rig file or the recording
 
     def residuals_of(self, *kinds: str) -> tuple[Any, ...]:
         """Residual records of these kinds of measurement ("corners", "points", ...), in the order of `kinds`."""
@@ -200,7 +201,7 @@ class Calibration:
         return usability(self)
 
     @property
-    def reasons(self) -> tuple[str, ...]:
+    def reasons(self) -> tuple[Remark, ...]:
         """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
         return reasons(self)
 
@@ -213,7 +214,7 @@ class Calibration:
     @property
     def failure(self) -> str:
         """A sentence that the solver did not converge and why; empty if it converged."""
-        return "" if self.converged else f"the solver did not converge: {self.status}"
+        return "" if self.converged else failure_words(self.status)
 
     def recording_of(self, seconds: np.ndarray) -> np.ndarray:
         """(n,) index into `recordings` of the recording in which each of `seconds` (n,) lies, on the clock of the

@@ -7,7 +7,7 @@ import hashlib
 import io
 import json
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from math import isnan
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 
 from icalib.base.files import NAME, load_arrays, printable, read_file, sealed
+from icalib.base.remark import Remark
 from icalib.base.yaml_nodes import LARGEST
 from icalib.errors import CalibrationError, RigError
 from icalib.geometry.so3 import rpy, rpy_std
@@ -48,7 +49,8 @@ from icalib.sensors.stream import Residuals, RowResiduals
 
 FORMAT, FORMAT_VERSION = "icalib result", 4
 RECORDS = (ImuResiduals, CornerResiduals, TrackResiduals, LidarResiduals)  # others are `RowResiduals`
-_TEXTS = ("unobservable", "warnings", "notes", "wrong")
+_REMARKS = ("unobservable", "warnings", "notes", "wrong")
+_UNKNOWN = "unknown"  # identifier of each sentence of an earlier result, which has none
 _PLAIN = ("status", "converged", "rig", "rates", "inputs", "settings", "versions", "timings")
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, IndexError)
 
@@ -96,7 +98,8 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "cross_validation": None if c.cross_validation is None else _plain_cross_validation(c.cross_validation),
         "verdict": c.verdict,
         "reasons": list(c.reasons),
-        **{name: list(getattr(c, name)) for name in _TEXTS},
+        **{name: list(getattr(c, name)) for name in _REMARKS},
+        "identifiers": {name: [r.name for r in getattr(c, name)] for name in ("reasons", *_REMARKS)},
         **{name: getattr(c, name) for name in _PLAIN},
         "made": c.made,
     }
@@ -186,10 +189,16 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         trajectory=Trajectory(**of(Trajectory, "trajectory")),
         recordings=tuple(RecordingSpan(**r) for r in plain["recordings"]),
         iterations=tuple(Iteration(*step) for step in zip(*steps, strict=True)),
-        **{name: tuple(plain[name]) for name in _TEXTS},
+        **{name: _remarks(plain, name) for name in _REMARKS},
         **{name: plain[name] for name in _PLAIN},
         made=str(plain.get("made", "")),  # earlier results have none
     )
+
+
+def _remarks(plain: dict[str, Any], name: str) -> tuple[Remark, ...]:
+    """The sentences of the list `name`, with their identifiers."""
+    names = plain["identifiers"][name] if "identifiers" in plain else [_UNKNOWN] * len(plain[name])
+    return tuple(Remark(str(identifier), sentence) for identifier, sentence in zip(names, plain[name], strict=True))
 
 
 def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]]) -> Residuals:
@@ -277,6 +286,7 @@ HEADER = """\
 # relative: T_a_b takes coordinates in the frame of b to that of a. Its covariance, from the joint one of both, is of
 #   rotation about the axes of b and translation along those of a; where one is unobservable it is that of the guess.
 # verdict of the whole: usable, usable with care, partly usable or not usable; reasons: why, the most important first.
+# reasons, unobservable, warnings, notes: identifier and sentence of each; docs/reasons.md lists the identifiers.
 # verdict of a component: determined (std within its tolerance), weak (up to 10 tolerances), too uncertain (above 10
 #   tolerances), unobservable (the data do not show it; it depends on its initial guess), or fixed by the rig file.
 # The full covariance and all residuals are in result.npz.
@@ -298,13 +308,13 @@ def calibration_yaml(calibration: Calibration) -> str:
         "status": c.status,
         "converged": bool(c.converged),
         "verdict": c.verdict,
-        "reasons": list(c.reasons),
+        "reasons": _by_name(c.reasons),
         "sensors": sensors,
         "targets": targets,
         "relative": {r.name: _relative(r) for r in relative_poses(c)},
-        "unobservable": list(c.unobservable),
-        "warnings": list(c.warnings),
-        "notes": list(c.notes),
+        "unobservable": _by_name(c.unobservable),
+        "warnings": _by_name(c.warnings),
+        "notes": _by_name(c.notes),
         "fits": [_fit(f) for f in c.fits],
     }
     frames = "" if c.imu is None else IMU + (KALIBR if c.lenses else "")
@@ -313,6 +323,10 @@ def calibration_yaml(calibration: Calibration) -> str:
         version=version, key=pose_key(c), body=body_name(c), reference=reference_name(c), frames=frames
     )
     return header + yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=1000, allow_unicode=True)
+
+
+def _by_name(remarks: Iterable[Remark]) -> list[dict[str, str]]:
+    return [{r.name: str(r)} for r in remarks]
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.cameras.base import CameraModel
 from icalib.motion.imu_data import hardly_turned
@@ -46,10 +47,15 @@ NEXT: dict[Usability, str] = {
     ),
     "not usable": "Act on the first reason, then calibrate again.",
 }
-_MEANINGS: dict[Verdict, str] = {
-    "unobservable": "unobservable, the value depends on the initial guess; {more}",
-    "too uncertain": "too uncertain, the standard deviation exceeds ten tolerances; {more}",
-    "weak": "weakly determined, the standard deviation exceeds the tolerance; {more}, or accept that uncertainty",
+_MEANINGS: dict[Verdict, Remark] = {
+    "unobservable": Remark("values_unobservable", "unobservable, the value depends on the initial guess; {more}"),
+    "too uncertain": Remark(
+        "values_too_uncertain", "too uncertain, the standard deviation exceeds ten tolerances; {more}"
+    ),
+    "weak": Remark(
+        "values_weak",
+        "weakly determined, the standard deviation exceeds the tolerance; {more}, or accept that uncertainty",
+    ),
 }
 AUXILIARY = tuple(spec.name for spec in ALL_SPECS if spec.is_auxiliary)
 WORST_FIRST: tuple[Verdict, ...] = ("unobservable", "too uncertain", "weak", "determined", "fixed")
@@ -70,10 +76,10 @@ def usability(c: Calibration) -> Usability:
     return "usable with care" if c.warnings or "weak" in verdicts else "usable"
 
 
-def reasons(c: Calibration) -> tuple[str, ...]:
+def reasons(c: Calibration) -> tuple[Remark, ...]:
     """Sentences on why the verdict is not `usable`, the most important first; empty if it is."""
     if not c.converged:
-        return tuple(dict.fromkeys([*c.wrong, c.failure, *c.warnings]))
+        return tuple(dict.fromkeys([*c.wrong, failure_words(c.status), *c.warnings]))
     verdicts = {v for g in c.groups for v in counted(c, g)} & {"weak", *UNUSABLE}
     # Standard deviations of a wrong model include its misfit, which a longer recording does not reduce.
     unusable, weak = ([], []) if c.wrong else ([*_named(c, *UNUSABLE)], [*_named(c, "weak")])
@@ -82,6 +88,11 @@ def reasons(c: Calibration) -> tuple[str, ...]:
     directions = c.unobservable if verdicts else ()
     first, last = (directions, ()) if "unobservable" in verdicts else ((), directions)
     return tuple(dict.fromkeys([*c.wrong, *first, *unusable, *rest, *weak, *last]))
+
+
+def failure_words(status: str) -> Remark:
+    """A sentence that the solver did not converge. status: why, one sentence."""
+    return Remark("solver_did_not_converge", f"the solver did not converge: {status}")
 
 
 def by_size(tolerances: float, by_guess: bool = False) -> Verdict:
@@ -145,24 +156,26 @@ def counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
     return () if g.mode == "prior" else g.verdict
 
 
-def _named(c: Calibration, *verdicts: Verdict) -> Iterator[str]:
+def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
     """Sentences on the components that have each of `verdicts`: first those whose standard deviation comes from the
     prior on IMU intrinsics, then all others but those that the sentence on an unobservable direction names."""
     for verdict in verdicts:
         components = [(name, by_imu) for name, v, by_imu in _components(c) if v == verdict]
         if names := [name for name, by_imu in components if by_imu]:
             prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
-            yield (
+            yield Remark(
+                "imu_prior_limits",
                 f"{_listed(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
                 f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial` or "
                 "`intrinsics: tactical`), or "
-                "`intrinsics: fixed` if it is calibrated."
+                "`intrinsics: fixed` if it is calibrated.",
             )
         names = [name for name, by_imu in components if not by_imu]
         if verdict == "unobservable":
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
-            yield f"{_listed(names)}: {_MEANINGS[verdict].format(more=_more(c))}."
+            meaning = _MEANINGS[verdict]
+            yield meaning.saying(f"{_listed(names)}: {meaning.format(more=_more(c))}.")
 
 
 def _more(c: Calibration) -> str:

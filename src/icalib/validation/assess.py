@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
+from icalib.base.remark import Remark
 from icalib.estimate.cross_validation import Prediction, predict, shifts
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, origin_difference
@@ -45,6 +46,7 @@ from icalib.result import (
     by_key,
 )
 from icalib.result.calibration import Timeline, row_record, versions
+from icalib.result.verdict import failure_words
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.validation.causes import all_causes, scatter_warnings
@@ -119,7 +121,7 @@ def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) ->
     return observe(determined, names, _column_specs(inputs), on_wheels, inputs.rig.has_target, axes)
 
 
-def _notes(assessed: AssessedEstimate) -> Iterator[str]:
+def _notes(assessed: AssessedEstimate) -> Iterator[Remark]:
     """Notes on the recordings and sensors, on ambiguous parameters, and on wrong guesses."""
     yield from notes(assessed)
     for assessment in assessments(assessed):
@@ -229,16 +231,17 @@ def _is_listed(inputs: Inputs, block: Block, spec: ParameterSpec) -> bool:
     return stated and (sensor.is_estimated(spec) or getattr(sensor, spec.name).mode == "fixed")
 
 
-def few_segments_notes(inputs: Inputs, segments: Segments | None) -> Iterator[str]:
+def few_segments_notes(inputs: Inputs, segments: Segments | None) -> Iterator[Remark]:
     """A note if standard deviations rest on few segments, with advice to get more."""
     if inputs.imu is not None:
         more = "record longer, and leave `segments` at 8 or more"
     else:
         more = f"record more {inputs.rig.sensors[inputs.rig.reference].readings}"
     if segments is not None and segments.count < ENOUGH_SEGMENTS:
-        yield (
+        yield Remark(
+            "few_segments",
             f"standard deviations rest on the spread of {segments.count} parts of the recording, by Student's t "
-            f"distribution {few_factor(segments.count):.2f} times as large as those of many; {more}."
+            f"distribution {few_factor(segments.count):.2f} times as large as those of many; {more}.",
         )
 
 
@@ -289,11 +292,11 @@ def _residuals(assessed: AssessedEstimate) -> Iterator[Residuals]:
                 yield row_record(key[1], rows, assessed.timeline)
 
 
-def _warnings(assessed: AssessedEstimate) -> Iterator[str]:
+def _warnings(assessed: AssessedEstimate) -> Iterator[Remark]:
     """Warnings on convergence, measurements, sensors, and estimates that cannot be right."""
     outcome = assessed.estimate.outcome
     if not outcome.converged:
-        yield f"the solver did not converge: {outcome.status}"
+        yield failure_words(outcome.status)
     yield from assessed.inputs.measurements.warnings
     for assessment in assessments(assessed):
         yield from assessment.warnings
@@ -310,14 +313,14 @@ def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
 # Notes on recordings and sensors, one sentence each.
 
 
-def notes(assessed: AssessedEstimate) -> Iterator[str]:
+def notes(assessed: AssessedEstimate) -> Iterator[Remark]:
     """Notes on the recordings, then on each kind of sensor."""
     timeline = assessed.timeline
     for k, span in enumerate(timeline.spans if len(timeline.spans) > 1 else (), 1):
         number, m = f"recording {k}", timeline.parts[k - 1].measurements
         name = number if span.name == number else f"{number}, {span.name}"
         timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
-        yield f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}."
+        yield Remark("recording_span", f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}.")
     yield from assessed.inputs.measurements.notes
     for assessment in assessments(assessed):
         yield from assessment.notes

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.parameter_changes import Change, changes, scatter
@@ -120,7 +121,7 @@ def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeli
     if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
         words = _change_words(alike, segments, timeline)
         share = f" This explains {min(best.gain / spread.beyond_chance, 1.0):.0%} of what varies over the recording."
-        yield Cause(words + share, best.gain, misfit.is_grave or _is_large(best, segments))
+        yield Cause(words.saying(words + share), best.gain, misfit.is_grave or _is_large(best, segments))
 
 
 def _is_large(c: Change, segments: Segments) -> bool:
@@ -129,7 +130,7 @@ def _is_large(c: Change, segments: Segments) -> bool:
     return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
 
 
-def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> str:
+def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> Remark:
     """A sentence that the stated noise is too small, as readings show, or too large, as residuals show. scales: fitting
     over stated density by kind of INERTIAL. Bias random walks are not shown: they become larger, too, never smaller."""
     is_small, n = max(scales.values()) > 1.0, imu.noise
@@ -138,15 +139,16 @@ def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> str:
         f"gyro: {gyro * n.gyro:.2g}, gyro_walk: {max(gyro, 1.0) * n.gyro_walk:.2g}, accel: {accel * n.accel:.2g}, "
         f"accel_walk: {max(accel, 1.0) * n.accel_walk:.2g}"
     )
-    return (
+    sentence = (
         f"the stated noise of {imu.name} is too {'small' if is_small else 'large'}: "
         f"over the stated one, {'readings in quiet moments show at least' if is_small else 'residuals show at most'} "
         f"{', '.join(f'{kind} {scale:.2g}x' for kind, scale in scales.items())}. Write noise: {{{fields}}} "
         "and calibrate again."
     )
+    return Remark("imu_noise_understated", sentence) if is_small else Remark("imu_noise_overstated", sentence)
 
 
-def unknown_words(rig: Rig, misfit: Misfit) -> str:
+def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
     """A sentence that the cause is unknown, with the checks that were made."""
     checks = {
         "noise of the readings, fixed values and priors": True,
@@ -155,27 +157,29 @@ def unknown_words(rig: Rig, misfit: Misfit) -> str:
         "swapped cameras": len(rig.cameras) > 1,
         "clocks that drift or jump, mounts that move, disturbances at one time": True,
     }
-    return (
+    return Remark(
+        "residuals_unexplained",
         f"residuals are larger than the stated noise predicts ({misfit.words}); the cause is unknown. "
         f"Checked: {', '.join(check for check, made in checks.items() if made)}. Do not state more noise than "
         "readings show: errors would stay larger than the standard deviations. Record again, with slower motion and "
-        "firm mounts, and compare both results by icalib compare."
+        "firm mounts, and compare both results by icalib compare.",
     )
 
 
-def _hit_words(hit: Disturbance, timeline: Timeline) -> str:
+def _hit_words(hit: Disturbance, timeline: Timeline) -> Remark:
     """A sentence on a disturbance at one time."""
     names = " and ".join(hit.sensors)
     part = "leave that part out"
     if timeline.can_be_cut:
         part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
-    return (
+    return Remark(
+        "disturbance_at_one_time",
         f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
-        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}."
+        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}.",
     )
 
 
-def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> str:
+def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> Remark:
     """A sentence on a change. alike: changes that explain about as much, the best first."""
     best = alike[0]
     others = list(dict.fromkeys(" and ".join(c.sensors) for c in alike if c.sensors != best.sensors))
@@ -186,7 +190,7 @@ def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -
     what = " or ".join(size for size, _ in changed)
     advice = " ".join(dict.fromkeys(against for _, against in changed))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
-    return (
+    return changed[0][0].saying(
         f"{_names(best)} changes {when}: {what}{instead}. {advice} Record again"
         f"{_apart(best, timeline, ', or calibrate the recording before or after that alone')}."
     )
@@ -196,32 +200,37 @@ def _names(c: Change) -> str:
     return " and ".join(c.sensors)
 
 
-def _changed(c: Change, segments: Segments) -> tuple[str, str]:
+def _changed(c: Change, segments: Segments) -> tuple[Remark, str]:
     """Texts with the size of a change of a lens, of wheels or of extrinsics, and what to do against it."""
     if c.name == "intrinsics":
-        size = f"its lens by up to {np.abs(c.value).max():.2g} px"
+        size = Remark("lens_changes", f"its lens by up to {np.abs(c.value).max():.2g} px")
         return size, "Switch off autofocus, zoom and image stabilisation."
     if c.name not in ("rotation", "translation"):
         value = segments.state.values[c.sensors[0], c.name]
-        size = f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
+        sentence = f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
+        size = Remark("wheel_sizes_change", sentence)
         return size, "Check tyres, load and encoders."
     turn, move = _sizes(segments, c)
-    return f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm", "Fasten all mounts."
+    return Remark(
+        "mount_moves", f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
+    ), "Fasten all mounts."
 
 
-def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> str:
+def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> Remark:
     """A sentence on a time offset that drifts or jumps. others: clocks that explain as much."""
     instead = f" (or that of {', or of '.join(others)} the opposite way)" if others else ""
     if c.pattern == "drift":
         span = float(np.ptp(segments.state.seconds[segments.ends]))
-        return (
+        return Remark(
+            "clock_drifts",
             f"the clock of {_names(c)}{instead} drifts against the others by about {1e6 * c.value[0] / span:+.0f} ppm, "
             f"{1e3 * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
-            "and record again."
+            "and record again.",
         )
-    return (
+    return Remark(
+        "clock_jumps",
         f"the time offset of {_names(c)}{instead} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock "
-        f"jumped, or stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}."
+        f"jumped, or stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}.",
     )
 
 
@@ -249,7 +258,7 @@ def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
 IMAGE_KINDS = ("corners", "features")
 
 
-def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
     """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
 
     against: values of the rig file that contradict an estimate without any of its values. Such an estimate is made only
@@ -270,7 +279,7 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 
-def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[str, ...]]:
+def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
     """Causes that are wrong values in the rig file: target size, scales, those that each kind of sensor tests, other
     values; and notes on the size."""
     inputs, factor = assessed.inputs, assessed.factor
@@ -397,7 +406,12 @@ def misfit_causes(assessed: AssessedEstimate, explained: bool) -> Iterator[Cause
     yield from noise
     if explained:
         if misfit.fits:
-            yield Cause(f"residuals are larger than the stated noise predicts: {misfit.words}.", 0.0)
+            yield Cause(
+                Remark(
+                    "residuals_exceed_noise", f"residuals are larger than the stated noise predicts: {misfit.words}."
+                ),
+                0.0,
+            )
         return
     if not noise or any(scatter[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
         yield from _unknown(rig, assessed.estimate, misfit)
@@ -406,7 +420,7 @@ def misfit_causes(assessed: AssessedEstimate, explained: bool) -> Iterator[Cause
             yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
 
 
-def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> str | None:
+def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence on residuals of one sensor that contradict the rig file; None if they do not. is_noise: whether they
     are white and constant over the recording; only then a larger noise is advised."""
     sensor = rig.sensors.get(f.sensor)
@@ -435,8 +449,11 @@ def _noise_of_imu(assessed: AssessedEstimate, scatter: Mapping[str, float]) -> I
     elif small:
         sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
         yield Cause(
-            f"residuals of {imu.name} are smaller than the stated noise predicts ({sizes}); standard "
-            "deviations are too large, if anything.",
+            Remark(
+                "imu_residuals_small",
+                f"residuals of {imu.name} are smaller than the stated noise predicts ({sizes}); standard "
+                "deviations are too large, if anything.",
+            ),
             0.0,
         )
 
@@ -485,13 +502,14 @@ def are_noise(rows: np.ndarray) -> bool:
     return bool(white and max(abs(np.log(max(s, 1e-12))) for s in sizes) < allowed)
 
 
-def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidation | None) -> Iterator[str]:
+def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidation | None) -> Iterator[Remark]:
     """Warnings on the scatter of estimates from segments. factors (n,): empirical factors of the sensors' parameters;
     split: whether the recording was cut into segments; validation: result of the cross-validation."""
     if len(factors) and factors.max() > LARGE_FACTOR:
-        yield (
+        yield Remark(
+            "segments_scatter",
             f"estimates from segments of the recording scatter {factors.max():.1f}x more than predicted; the printed "
-            "standard deviations are inflated accordingly."
+            "standard deviations are inflated accordingly.",
         )
     if (
         validation is not None
@@ -499,12 +517,14 @@ def scatter_warnings(factors: np.ndarray, split: bool, validation: CrossValidati
         and validation.optimistic
         and validation.factor > BEYOND_FACTOR * factors.max()
     ):
-        yield (
+        yield Remark(
+            "halves_disagree",
             f"one half of the recording predicts the other {validation.factor:.1f}x worse than predicted, and the "
-            f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small."
+            f"printed standard deviations are only {factors.max():.1f}x the formal ones: they are too small.",
         )
     if not split:
-        yield (
+        yield Remark(
+            "recording_too_short",
             "the recording is too short for segments (or segments are off): standard deviations are formal and too "
-            "small, as they include white noise only. Record longer."
+            "small, as they include white noise only. Record longer.",
         )

@@ -7,6 +7,7 @@ from itertools import permutations, product
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, groups_of
@@ -27,7 +28,7 @@ from icalib.sensors.sensor import TRANSLATION
 # Notes on initial guesses of the rig file that the data contradict, with likely mistakes.
 
 
-def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[str]:
+def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
     """One sentence for each initial guess that the estimate contradicts, by the kind of sensor or `is_contradicted`."""
     groups_by_key = {(g.sensor, g.name): g for g in groups}
     for sensor, name, parameter in groups_of(inputs.user_rig or inputs.rig):
@@ -40,9 +41,8 @@ def guess_notes(inputs: Inputs, groups: Sequence[ParameterGroup]) -> Iterator[st
         if far:
             rotation = groups_by_key.get((sensor.name, "rotation"))
             R_imu_sensor = None if rotation is None else rotation.value
-            yield _sentence(group, guess) + looks_like(
-                inputs.rig, (sensor.name, name), guess, group.value, R_imu_sensor
-            )
+            hint = looks_like(inputs.rig, (sensor.name, name), guess, group.value, R_imu_sensor)
+            yield Remark("guess_contradicted", _sentence(group, guess) + hint)
 
 
 def _sentence(group: ParameterGroup, guess: np.ndarray) -> str:
@@ -117,7 +117,9 @@ def _angle(a: np.ndarray, b: np.ndarray) -> float:
 # Warnings on fixed values and priors of the rig file that the data contradict.
 
 
-def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]) -> Iterator[str]:
+def absurd_values(
+    inputs: Inputs, against: Sequence[Contradiction], groups: Sequence[ParameterGroup]
+) -> Iterator[Remark]:
     """Sentences on sensors with impossible values, unless they contradict a stated value in `against`."""
     groups_by_key = {(g.sensor, g.name): g for g in groups}
     named = {c.key[0] for c in against}
@@ -126,7 +128,7 @@ def absurd_values(inputs: Inputs, against: Sequence[Contradiction], groups: Sequ
             yield from assessors()[sensor.sensor_type].absurd(sensor, groups_by_key)
 
 
-def stated_words(inputs: Inputs, c: Contradiction) -> str:
+def stated_words(inputs: Inputs, c: Contradiction) -> Remark:
     """A sentence on the contradiction `c`: both values, their standard deviations and distance, and a likely
     mistake."""
     spec = inputs.specs[c.key]
@@ -146,10 +148,13 @@ def stated_words(inputs: Inputs, c: Contradiction) -> str:
     kind, advice = ("fixed value", "leave it free") if stated is None else ("prior", "give it a larger sigma")
     assert c.parameter.value is not None
     hint = looks_like(inputs.rig, c.key, c.parameter.value, c.value)
-    return (
+    sentence = (
         f"the {kind} of {given} contradicts the data, which alone show {estimate_text}: {c.away[c.worst]:.0f} standard "
         f"deviations away; correct it, or {advice}.{hint}"
     )
+    if stated is None:
+        return Remark("fixed_value_contradicted", sentence)
+    return Remark("prior_contradicted", sentence)
 
 
 def scaled(values: np.ndarray, scale: float) -> str:
@@ -189,7 +194,7 @@ def is_certain(size: TargetSize | None) -> bool:
     return size is not None and abs(size.ratio - 1.0) > max(BEYOND, CLEARLY * size.std)
 
 
-def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[Remark, ...], tuple[Remark, ...]]:
     """Warnings, and notes, on the size of the target."""
     if size is None:
         return (), ()
@@ -199,19 +204,23 @@ def size_words(inputs: Inputs, size: TargetSize | None) -> tuple[tuple[str, ...]
     by = "the accelerometer" + (" and what else shows it" if others else "")
     words = f"by {by} the target is {ratio} times the size that the rig file says"
     if abs(size.ratio - 1.0) <= max(WRONG, CLEARLY * size.std):
-        return (), (f"{words}; accelerometers may be off by 1 to 3 % themselves.",)
-    warning = (
+        return (), (
+            Remark("target_size_by_accelerometer", f"{words}; accelerometers may be off by 1 to 3 % themselves."),
+        )
+    warning = Remark(
+        "target_size_wrong",
         f"{words}, and so are the distances that cameras show; measure the printed target and correct its size in "
-        "the rig file, or if that is right calibrate the accelerometer, whose scale is off."
+        "the rig file, or if that is right calibrate the accelerometer, whose scale is off.",
     )
     return (warning,), ()
 
 
-def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[str]:
+def scale_notes(inputs: Inputs, size: TargetSize | None) -> Iterator[Remark]:
     """A note if the scale of all lengths comes from a single source."""
     sources = scale_sources(inputs, size)
     if len(sources) == 1:
-        yield f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every length here."
+        sentence = f"every length comes from {sources[0]} alone: 1 % error there is 1 % in every length here."
+        yield Remark("scale_from_one_source", sentence)
 
 
 def scale_sources(inputs: Inputs, size: TargetSize | None) -> list[str]:
@@ -243,9 +252,12 @@ def scale_causes(inputs: Inputs, groups: Sequence[ParameterGroup], size: TargetS
     first, *others = scale_sources(inputs, size)
     more = " and ".join(others) or "what else shows a length"
     yield Cause(
-        f"{first} and {more} contradict each other: lengths differ by {apart:.1f} % or more, "
-        f"{max(away.values()):.0f} standard deviations of what the rig file allows; find out which is wrong, and "
-        "correct it in the rig file.",
+        Remark(
+            "lengths_contradict",
+            f"{first} and {more} contradict each other: lengths differ by {apart:.1f} % or more, "
+            f"{max(away.values()):.0f} standard deviations of what the rig file allows; find out which is wrong, and "
+            "correct it in the rig file.",
+        ),
         float(sum(a**2 for a in away.values())),
         True,
         tuple((s.name, name) for s in sensors for name in assessors()[s.sensor_type].sizes(s)),

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.cases import each
+from tests.typed import not_none
 
 from icalib.optim.rows import LOSSES, robust_weights
 from icalib.rig import Settings
@@ -61,9 +62,9 @@ def test_the_sentence_names_the_cameras_and_stamps_of_the_rejected_sets(cameras)
     cameras[0] = replace(cameras[0], keyframe=keyframe + (keyframe >= 2))  # none at keyframe 2
     late = [np.isin(camera.keyframe, [2]) for camera in cameras]
     first, stamps = cameras[0].stream.stamps_ns, cameras[1].stream.stamps_ns
-    words = late_words(cameras, late)
+    words = not_none(late_words(cameras, late))
     assert words.startswith("1 sets of images of cam1 and cam2 ") and words.endswith(f": at {stamps[2]} ns.")
-    words = late_words(cameras, [np.isin(camera.keyframe, [2, 4]) for camera in cameras])
+    words = not_none(late_words(cameras, [np.isin(camera.keyframe, [2, 4]) for camera in cameras]))
     assert words.startswith("2 sets of images of cam0 and cam1 and cam2 ")
     assert words.endswith(f": at {stamps[2]} ns, at {first[3]} ns.")
-    assert late_words(cameras, [np.zeros(len(camera.keyframe), dtype=bool) for camera in cameras]) == ""
+    assert late_words(cameras, [np.zeros(len(camera.keyframe), dtype=bool) for camera in cameras]) is None

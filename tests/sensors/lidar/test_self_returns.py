@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.cases import each
+from tests.remarks import remark
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.sensors.lidar.initialize import self_returns
@@ -84,7 +85,7 @@ def test_of_a_long_recording_its_middle_tells(robot, monkeypatch):
 def test_what_is_said_and_what_stays(robot):
     r = robot(16.0, 1, {"azimuth_steps": 300}, example="table2-planar")
     stream, hit = with_panel(r.streams[0], *PANELS["panel ahead"])
-    recording = replace(Measurements.of_streams(r.sim.measurements.imu, stream), warnings=("before.",))
+    recording = replace(Measurements.of_streams(r.sim.measurements.imu, stream), warnings=(remark("before."),))
     found = without_self_returns(recording)
     before, (said,) = found.warnings[0], found.warnings[1:]
     assert before == "before." and said.startswith("lidar0 has self-returns: ") and said.endswith(".")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
+from tests.remarks import remark
 
 from icalib.errors import CalibrationError
 from icalib.result import Calibration, Verdict
@@ -109,7 +110,8 @@ def test_results_that_cannot_be_read_or_compared_are_notes(results: dict[str, Ca
 
 def test_a_result_that_is_not_usable_is_compared_with_nothing(results: dict[str, Calibration]):
     good = results["r0"]
-    bad = dataclasses.replace(results["turned"], wrong=("cam1 is wrong.",), warnings=("cam1 is wrong.",))
+    wrong = (remark("cam1 is wrong."),)
+    bad = dataclasses.replace(results["turned"], wrong=wrong, warnings=wrong)
     found = drift([good, bad, good])
     assert (found.changes, found.unsure, found.n_tested) == ((), (), 8)
     assert found.notes == ("job 1 is not usable and is not compared: cam1 is wrong.",)

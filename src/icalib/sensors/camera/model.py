@@ -8,6 +8,7 @@ from itertools import permutations
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import CornerStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry.cameras import camera_model
@@ -406,7 +407,8 @@ def without_bodies(target: Target, names: Sequence[str], recording: Measurements
     """The recording without corners of the bodies called `names`, with a note on them."""
     kept = tuple(k for k, name in enumerate(target.bodies) if name not in names)
     cameras = [_restricted(Bodies(target, kept), c) for c in recording.cameras]
-    note = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
+    sentence = f"ignored, because no image determines their poses relative to the others: {_listed(names)}."
+    note = Remark("bodies_unconnected", sentence)
     return replace(recording.with_streams(*cameras), notes=(*recording.notes, note))
 
 
@@ -419,13 +421,14 @@ def _restricted(bodies: Bodies, stream: CornerStream) -> CornerStream:
     return stream.of_rows(order, stream.stamps_ns[count > 0], count[count > 0])
 
 
-def words_on_left_out(bodies: Bodies) -> str:
-    """A sentence on the bodies that were seen but are not used; empty if there are none."""
+def words_on_left_out(bodies: Bodies) -> Remark | None:
+    """A sentence on the bodies that were seen but are not used; None if there are none."""
     if not bodies.left_out:
-        return ""
+        return None
     names = [bodies.target.bodies[k] for k in bodies.left_out]
-    return (
-        f"ignored, because fewer than {MIN_SHARED_IMAGES} images show them together with the others: {_listed(names)}."
+    return Remark(
+        "bodies_seen_rarely",
+        f"ignored, because fewer than {MIN_SHARED_IMAGES} images show them together with the others: {_listed(names)}.",
     )
 
 

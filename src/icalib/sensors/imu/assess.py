@@ -7,6 +7,7 @@ from math import comb
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
@@ -30,7 +31,7 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
     yield ImuResiduals(chain.name, np.delete(seconds, between), np.delete(whitened, between, axis=0))
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """Notes on noise, the prior of the intrinsics and gaps; without an IMU, on the assumed smooth motion."""
     imu = inputs.imu
     if imu is None:
@@ -38,35 +39,38 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
     assert inputs.rig.imu is not None
     n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
     if inputs.rig.assumes_motion:
-        yield (
+        yield Remark(
+            "smooth_motion_assumed",
             f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
-            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis)."
+            f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis).",
         )
         return
-    yield (
+    yield Remark(
+        "imu_noise_stated",
         f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
-        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}."
+        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}.",
     )
     if words := _intrinsics_words(inputs.rig.imu):
         yield words
     for a, b in imu.gaps:
         how = "bridged" if b - a <= most else "left out, with the images in it"
-        yield f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}."
+        yield Remark("imu_gap", f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}.")
 
 
-def _intrinsics_words(imu: ImuSensor) -> str:
-    """A sentence on the prior of the intrinsics; empty if they have none."""
+def _intrinsics_words(imu: ImuSensor) -> Remark | None:
+    """A sentence on the prior of the intrinsics; None if they have none."""
     if imu.intrinsics.mode != "prior" or imu.intrinsics.sigma is None:
-        return ""
+        return None
     sigma = dict(zip(INTRINSICS_LABELS, imu.intrinsics.sigma.tolist(), strict=True))
     turn, whose = np.rad2deg(sigma["accel_rotation_x"]), prior_words(imu.intrinsics.sigma)
-    return (
+    return Remark(
+        "imu_intrinsics_prior",
         f"prior of IMU intrinsics {whose}: scale {100.0 * sigma['accel_xx']:.2g} % (accelerometer), "
-        f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations)."
+        f"{100.0 * sigma['gyro_xx']:.2g} % (gyroscope), rotation between them {turn:.2g} deg (standard deviations).",
     )
 
 
-def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> Remark | None:
     """Always None: `validation` tests the noise of the IMU separately, as all other sensors depend on it."""
     return None
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes import count_directions, normal_shares
 from icalib.estimate.estimate import Estimate
@@ -139,7 +140,7 @@ def _used(estimate: Estimate, name: str) -> int:
     return sum(int(f.moments.count.sum()) for f in of_type(estimate.problem.factors, LidarFactor) if f.name == name)
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """Notes on the number of points used and their noise."""
     if not inputs.association.count:
         return
@@ -149,13 +150,14 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
         size = f"{1e3 * noise.beam_sigma:.1f} mm along the beam, as the rig file has it"
         if not given:
             size = f"{1e3 * noise.sigma:.1f} mm from their planes, as residuals show it"
-        yield (
+        yield Remark(
+            "lidar_points_used",
             f"{_used(estimate, lidar.name)} of the {len(stream.xyz)} points of {lidar.name} lie on "
-            f"{inputs.association.count} planes; noise {size}."
+            f"{inputs.association.count} planes; noise {size}.",
         )
 
 
-def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """Warnings: degenerate scene, wrong point times, few points on planes, stamps at the wrong end of a scan."""
     if not inputs.association.count:
         return
@@ -163,26 +165,29 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
     for index, (lidar, stream) in enumerate(zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)):
         stretch, std = _time_stretch(inputs, estimate, index)
         if abs(stretch) > max(MAX_TIME_STRETCH, SIGNIFICANT_STRETCH * std):
-            yield (
+            yield Remark(
+                "scan_times_wrong",
                 f"the times of points within a scan of {lidar.name} seem too {'short' if stretch > 0.0 else 'long'}, "
                 "or in the wrong order: points lie off their planes in proportion to the motion. Check their unit, "
-                "their origin and the sense of rotation, or set point_time in the rig file."
+                "their origin and the sense of rotation, or set point_time in the rig file.",
             )
         share = _used(estimate, lidar.name) / max(len(stream.xyz), 1)
         if share < MIN_SHARE_ON_PLANES:
-            yield (
+            yield Remark(
+                "few_lidar_points_on_planes",
                 f"only {share:.1%} of the points of {lidar.name} lie on planes; the scene has few flat surfaces, or "
-                "the times of its points, their order within a scan, or its range_noise in the rig file are wrong."
+                "the times of its points, their order within a scan, or its range_noise in the rig file are wrong.",
             )
         offsets = estimate.outcome.state.values[lidar.name, "time_offset"]
         offsets = offsets - origin_difference(inputs.measurements, stream)
         period = float(np.median(np.diff(stream.seconds)))
         offset = float(offsets[np.argmin(np.abs(np.abs(offsets) - period))])
         if abs(abs(offset) - period) < PERIOD_TOLERANCE * period:
-            yield (
+            yield Remark(
+                "stamps_at_scan_end",
                 f"the time_offset of {lidar.name}, {offset:+.4f} s, is about the period of its scans: its stamps may "
                 "be those of the end of a scan while times of points count from its start, or the other way; see "
-                "point_time."
+                "point_time.",
             )
 
 
@@ -208,27 +213,29 @@ def _time_stretch(inputs: Inputs, estimate: Estimate, index: int) -> tuple[float
     return -float(J_stretch @ residual) / information, float(residual.std()) / np.sqrt(information)
 
 
-def _degeneracy_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def _degeneracy_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """A warning if LiDARs alone give the motion, and their planes face fewer than three directions."""
     if any(s.gives_motion for s in inputs.rig.mounted if not isinstance(s, Lidar)):
         return
     normals = np.array([estimate.outcome.state.values[key][:3] for key in inputs.association.keys])
     if count_directions(normal_shares(normals, inputs.association.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
-        yield (
+        yield Remark(
+            "scene_like_corridor",
             f"the planes that {names} saw face two directions only, as in a corridor: only the IMU constrains the "
             "motion along both. Do not trust the result if the solver did not converge; better record where walls and "
-            "floor face three directions."
+            "floor face three directions.",
         )
 
 
-def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if points are farther from planes than the stated range noise predicts, else None."""
     if excess(f) == 1.0 or lidar.range_noise_m is None:
         return None
-    return (
+    return Remark(
+        "range_noise_understated",
         f"residuals of the points of {f.sensor} are {times(f)} larger than its range_noise predicts; leave it out, "
-        "and it is estimated."
+        "and it is estimated.",
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, with_association
 from icalib.estimate.residual_statistics import Segments
@@ -26,10 +27,9 @@ from icalib.sensors.pose.residual import POSE_KINDS, PoseFactor, PoseNoise, Rela
 MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
 # Standard deviations of a difference between rotations and positions that is covered: chance exceeds them in 1 of 80.
 COVERED_SIGMAS = 2.5
-UNKNOWN_CAUSE = "they are no white noise, and the cause is unknown: check its clock and mount, and record again, slower"
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
     counts = {
         f.name: f.count(out, "rotation") // 3
@@ -39,7 +39,7 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
     for sensor, stream, noise in zip(inputs.rig.poses, inputs.measurements.poses, posing, strict=True):
         what = "poses" if sensor.kind == "absolute" else "steps"
         count = f"{counts[sensor.name]} {what} from {len(stream.stamps_ns)} poses"
-        yield f"{count} of {sensor.name}; {_noise(sensor, noise)}."
+        yield Remark("pose_noise_used", f"{count} of {sensor.name}; {_noise(sensor, noise)}.")
 
 
 def _noise(sensor: PoseSensor, noise: PoseNoise) -> str:
@@ -56,8 +56,8 @@ def _source(given: float | None) -> str:
 
 def inner_contradictions(
     inputs: Inputs, estimate: Estimate, segments: Segments | None
-) -> Iterator[tuple[str, np.ndarray]]:
-    """For each pose sensor whose positions are turned against its rotations: a sentence, empty below SIGMAS, and the
+) -> Iterator[tuple[Remark | None, np.ndarray]]:
+    """For each pose sensor whose positions are turned against its rotations: a sentence, None below SIGMAS, and the
     change (B,) of the calibration parameters to the farther of two estimates: by its rotations, or by its positions."""
     outcome = estimate.outcome
     if segments is None or not outcome.converged:
@@ -71,22 +71,24 @@ def inner_contradictions(
         if relative and columns.min() >= 0:
             by_positions = change[columns] + turn.value
             change[columns] = np.where(np.abs(by_positions) > np.abs(change[columns]), by_positions, change[columns])
-        yield _turned_words(factor.name, relative, turn) if turn.sigmas > SIGMAS else "", change
+        yield _turned_words(factor.name, relative, turn) if turn.sigmas > SIGMAS else None, change
 
 
-def _turned_words(name: str, relative: bool, turn: LeftOut) -> str:
+def _turned_words(name: str, relative: bool, turn: LeftOut) -> Remark:
     """A sentence on positions that are turned against rotations."""
     what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
     angle = float(np.linalg.norm(turn.value))
     axis = ", ".join(f"{-x:.2f}" for x in turn.value / angle)
-    return (
+    return Remark(
+        "rotations_contradict_positions",
         f"rotations and {what} of {name} contradict each other: its {what} are turned by {np.rad2deg(angle):.2g} deg, "
         f"{turn.sigmas:.0f} standard deviations, about the axis ({axis}) of its {axes}; the printed standard "
-        "deviations cover the difference. To rely on its rotations, state a position_noise ten times as large as noted."
+        "deviations cover the difference. To rely on its rotations, state a position_noise ten times as large as "
+        "noted.",
     )
 
 
-def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """Warnings on residuals that are correlated in time: poses are filtered or drift, or the kind (absolute, relative)
     is wrong."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PoseFactor):
@@ -94,17 +96,19 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
         correlations = _correlations(rows)
         for what, correlation in correlations.items():
             if sensor.kind == "relative" and correlation < -MAX_LAG_ONE_ANTICORRELATION:
-                yield (
+                yield Remark(
+                    "relative_poses_alternate",
                     f"the {what} residuals of {factor.name} alternate (correlation {correlation:.2f} from step to "
-                    "step), as those of poses that are noisy but do not drift; try kind: absolute."
+                    "step), as those of poses that are noisy but do not drift; try kind: absolute.",
                 )
         following = [(w, c) for w, c in correlations.items() if c > MAX_LAG_ONE_CORRELATION]
         if sensor.kind == "absolute" and following:
             what, correlation = " and ".join(w for w, _ in following), max(c for _, c in following)
-            yield (
+            yield Remark(
+                "poses_filtered_or_drifting",
                 f"the {what} residuals of {factor.name} follow one another (correlation {correlation:.2f} from pose to "
                 "pose): its poses are filtered, or drift; trust the empirical factor. "
-                f"{_trial(inputs, estimate, sensor)}"
+                f"{_trial(inputs, estimate, sensor)}",
             )
 
 
@@ -142,13 +146,19 @@ def _trial(inputs: Inputs, estimate: Estimate, sensor: PoseSensor) -> str:
     return f"Tried kind: relative, which lets poses drift: its steps are not white, either (correlation {worst:.2f})."
 
 
-def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if residuals are larger than the stated noise predicts, else None. is_noise: whether residuals are
     white and constant over the recording, so that a larger stated noise is the remedy."""
     if excess(f) == 1.0:
         return None
-    advice = "leave it out, and it is estimated" if is_noise else UNKNOWN_CAUSE
-    return f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts; {advice}."
+    words = f"{f.kind} residuals of {f.sensor} are {times(f)} larger than its stated noise predicts"
+    if is_noise:
+        return Remark("pose_noise_understated", f"{words}; leave it out, and it is estimated.")
+    return Remark(
+        "pose_residuals_not_white",
+        f"{words}; they are no white noise, and the cause is unknown: check its clock and mount, and record again, "
+        "slower.",
+    )
 
 
 def length(sensor: PoseSensor, rig: Rig) -> str | None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.motion.factor import Whitened, pairs_of
@@ -36,7 +37,7 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
         yield row_record("positions", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """Sentences on the number of fixes in use, their noise, and time offsets that are differences of time scales."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
         sensor, stream = inputs.sensor(factor.name), inputs.stream(factor.name)
@@ -44,7 +45,8 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
         used = f"{int(factor.used.sum())} of {len(stream.stamps_ns)} fixes of {factor.name}"
         wrong = int((~factor.used).sum())
         rejected = f"; {wrong} are outliers of the trajectory, the largest by {_largest(factor, rows):.2g} m"
-        yield f"{used}{rejected if wrong else ''}; {_noise(sensor, stream, factor.noise)}."
+        sentence = f"{used}{rejected if wrong else ''}; {_noise(sensor, stream, factor.noise)}."
+        yield Remark("position_noise_used", sentence)
         offset = estimate.outcome.state.values[factor.name, "time_offset"]
         offset = offset - origin_difference(inputs.measurements, stream)
         yield from scale_of_time(factor.name, float(offset[0]))
@@ -69,18 +71,19 @@ def _noise(sensor: PositionSensor, stream: PositionStream, noise: PositionNoise)
     return f"noise {sizes[0]:.3g} mm horizontal and {sizes[1]:.3g} mm vertical, as residuals show it"
 
 
-def scale_of_time(name: str, offset: float) -> Iterator[str]:
+def scale_of_time(name: str, offset: float) -> Iterator[Remark]:
     """A sentence if the time offset [s] is about the difference between two time scales, see `SCALES`."""
     for seconds, scales in SCALES.items():
         if abs(abs(offset) - seconds) < SAME_SCALE_S:
             beyond = abs(offset) - seconds
-            yield (
+            yield Remark(
+                "time_scales_differ",
                 f"the time offset of {name}, {offset:+.3f} s, is the {seconds:.0f} s between {scales}, and "
-                f"{beyond:+.3f} s."
+                f"{beyond:+.3f} s.",
             )
 
 
-def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """A sentence for each sensor whose successive residuals are correlated, so that its sigmas are too small."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
         whitened = rows.residual[factor.used]
@@ -90,23 +93,28 @@ def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
         density = random_walk_of(factor.seconds, np.where(factor.used[:, None], factor.raw(rows), np.nan))
         known = inputs.sensor(factor.name).position_random_walk
         advice = f"set position_random_walk: {np.hypot(known, density):.2g} in the rig file" if density else ""
-        yield (
+        yield Remark(
+            "position_errors_correlated",
             f"the residuals of {factor.name} are correlated ({correlation:.2f} from fix to fix); the cause is unknown. "
             "Its standard deviations may be 1.3 times too small; "
-            f"{advice or 'leave out worse fixes with least_status'}."
+            f"{advice or 'leave out worse fixes with least_status'}.",
         )
 
 
-def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if the residuals are larger than the stated noise predicts, else None."""
     if excess(f) == 1.0:
         return None
     if f.kind == SLOW_OFFSET:
-        return f"the slow offset of {f.sensor} is {times(f)} larger than position_random_walk predicts; make it larger."
+        return Remark(
+            "position_random_walk_understated",
+            f"the slow offset of {f.sensor} is {times(f)} larger than position_random_walk predicts; make it larger.",
+        )
     stated = "the recording states" if sensor.position_noise == MESSAGES else "position_noise predicts"
-    return (
+    return Remark(
+        "position_noise_understated",
         f"{f.kind} residuals of {f.sensor} are {times(f)} larger than {stated}; leave position_noise out, and it is "
-        "estimated."
+        "estimated.",
     )
 
 

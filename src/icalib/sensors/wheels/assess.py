@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.geometry.small import is_near
@@ -50,46 +51,51 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
         yield row_record("increments", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """A note if only the assumption of an upright camera decides whether wheels are upside down."""
     for wheels, up in _without_vertical(inputs, estimate):
         if not inputs.rig.moves_by_poses and _posture(up) is None:
-            yield (
+            yield Remark(
+                "vertical_from_camera",
                 f"{wheels}: nothing but {_body(inputs)}, which then stands upright, shows which way is up; if it is "
-                f"upside down, {_other_vertical(inputs, wheels)}."
+                f"upside down, {_other_vertical(inputs, wheels)}.",
             )
 
 
-def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """Warnings if no LiDAR sees the ground of wheels, or if no sensor determines the vertical."""
     yield from ground_warnings(estimate)
     yield from _upwards_warnings(inputs, estimate)
 
 
-def ground_warnings(estimate: Estimate) -> Iterator[str]:
+def ground_warnings(estimate: Estimate) -> Iterator[Remark]:
     """A warning for each ground factor whose floor no LiDAR sees."""
     for factor in of_type(estimate.problem.factors, GroundFactor):
         if not len(factor.keyframes):
-            yield (
+            yield Remark(
+                "ground_not_seen",
                 f"none of the planes that LiDARs see is a floor (nearly level and below the IMU), so the ground of "
-                f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level."
+                f"{factor.name} counts for nothing; see that a LiDAR sees it, or write plane: level.",
             )
 
 
-def _upwards_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def _upwards_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """A warning with both possible verticals if no sensor determines the sign of the vertical, and the assumption of an
     upright camera does not apply: the motion comes from pose sensors, or the camera is not upright in the result."""
     for wheels, up in _without_vertical(inputs, estimate):
         if inputs.rig.moves_by_poses:
             x, y, z = up
-            yield (
+            yield Remark(
+                "vertical_unknown_for_poses",
                 f"{wheels}: nothing shows which way is up: no frame of a pose sensor is level. Here up is ({x:.2f}, "
-                f"{y:.2f}, {z:.2f}) in the axes of {_body(inputs)}; if that is down, {_other_vertical(inputs, wheels)}."
+                f"{y:.2f}, {z:.2f}) in the axes of {_body(inputs)}; if that is down, "
+                f"{_other_vertical(inputs, wheels)}.",
             )
         elif posture := _posture(up):
-            yield (
+            yield Remark(
+                "vertical_ambiguous",
                 f"{wheels}: nothing shows which way is up. Either {_body(inputs)} {posture}, or "
-                f"{_other_vertical(inputs, wheels)}."
+                f"{_other_vertical(inputs, wheels)}.",
             )
 
 
@@ -126,28 +132,31 @@ def _other_vertical(inputs: Inputs, name: str) -> str:
     return REVERSED_YAW[wheels.kind]
 
 
-def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(wheels: Wheels, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if residuals are larger than the rig file states, with the field to change; else None."""
     if excess(f) == 1.0:
         return None
     if f.kind in (TILT, HEIGHT):
         field = "tilt_noise" if f.kind == TILT else "bump_noise"
         what = "tilts against" if f.kind == TILT else "moves up and down over"
-        return (
+        return Remark(
+            "ground_not_even",
             f"{wheels.name} {what} its ground {times(f)} more than {field} predicts, as on ramps or where the ground "
-            "is another plane; take ground out, or that part of the recording."
+            "is another plane; take ground out, or that part of the recording.",
         )
     relative = f.kind == "yaw" and wheels.kind == "pair"  # relative poses of a pair have a yaw, too
     what, field, unit = _ROWS.get("" if relative else f.kind, (f.kind, "", ""))
     words = f"{what} residuals of {wheels.name} are {times(f)} larger than {field or 'its noise'} predicts"
     if not is_noise:
-        return (
+        return Remark(
+            "wheel_residuals_not_white",
             f"{words}, and are no white noise; the cause is unknown. Wheels that skid, stop counting or lose air have "
-            "such residuals. Take out parts where they are large."
+            "such residuals. Take out parts where they are large.",
         )
     if not field:
-        return f"{words}; use factor: increments."
-    return f"{words}; write {field}: {excess(f) * getattr(wheels, field):.2g} ({unit}) and calibrate again."
+        return Remark("wheel_pose_residuals_large", f"{words}; use factor: increments.")
+    sentence = f"{words}; write {field}: {excess(f) * getattr(wheels, field):.2g} ({unit}) and calibrate again."
+    return Remark("wheel_noise_understated", sentence)
 
 
 def length(wheels: Wheels, rig: Rig) -> str | None:
@@ -162,7 +171,7 @@ def sizes(wheels: Wheels) -> tuple[str, ...]:
     return (wheels.drive_specs[0].name,)
 
 
-def absurd(wheels: Wheels, groups: Groups) -> Iterator[str]:
+def absurd(wheels: Wheels, groups: Groups) -> Iterator[Remark]:
     """A sentence if the ratio of radius to baseline is implausible, as for readings in a wrong unit."""
     if wheels.kind != "pair":
         return
@@ -175,9 +184,10 @@ def absurd(wheels: Wheels, groups: Groups) -> Iterator[str]:
     cause = {"ticks": "its counts_per_turn", "rates": "its rate_unit"}.get(
         wheels.measures, "whether its angles are in radians"
     )
-    yield (
+    yield Remark(
+        "wheel_sizes_implausible",
         f"the wheels of {wheels.name} come out with a radius of {1e3 * radii.value.mean():.3g} mm and "
-        f"{1e3 * baseline.value[0]:.4g} mm between them, which no vehicle has; check {cause}."
+        f"{1e3 * baseline.value[0]:.4g} mm between them, which no vehicle has; check {cause}.",
     )
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.images import Note
 from icalib.data.measurements import WheelStream
 from icalib.data.messages import HasMessages, MessageType, TopicInfo, TwistStream, all_messages, read_twists
@@ -315,7 +316,7 @@ _TURNING_RAD_S, _DRIVING_M_S, _STEERING_RAD = 0.5, 0.1, 0.05  # larger values ar
 
 def checked_wheels(
     read: WheelReadings | WheelPoses, wheels: Wheels, where: str
-) -> tuple[WheelStream | WheelPoses, tuple[str, ...]]:
+) -> tuple[WheelStream | WheelPoses, tuple[Remark, ...]]:
     """The checked `WheelStream`, or the relative poses unchanged; and notes on what was left out or looks implausible.
 
     Angles and ticks become mean rates between their stamps, so that rate times period is the angle turned. The first
@@ -349,7 +350,7 @@ def _some(read: WheelReadings, kept: np.ndarray) -> WheelReadings:
     return read if kept.all() else WheelReadings(read.name, read.stamps_ns[kept], read.value[kept])
 
 
-def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[Remark, ...]]:
     """`read` without readings that are not finite, and a note. Raises RecordingError if most readings are not
     finite."""
     good = np.logical_and.reduce(np.abs(read.value) < _ANY_VALUE, axis=1)
@@ -361,9 +362,9 @@ def _finite(read: WheelReadings, what: str) -> tuple[WheelReadings, tuple[str, .
             f"{what}: {count} of {len(good)} readings are not finite, the first at {first} ns; correct the "
             "program that writes them."
         )
-    return _some(read, good), (
-        f"{what}: {count} of {len(good)} readings are not finite and were removed, the first at {first} ns.",
-    )
+    sentence = f"{what}: {count} of {len(good)} readings are not finite and were removed, the first at {first} ns."
+    note = Remark("wheel_readings_not_finite", sentence)
+    return _some(read, good), (note,)
 
 
 def _signed(read: WheelReadings, wheels: Wheels, what: str) -> WheelReadings:
@@ -383,13 +384,13 @@ def _turning(read: WheelReadings, wheels: Wheels) -> int:
     return read.value.shape[1] // (2 if wheels.kind == "steered" else 1)
 
 
-def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+def _even_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[Remark, ...]]:
     """Rates or velocities without outliers, and a note."""
     off, outlier = apart(read.value, read.seconds)
     return _some(read, ~np.logical_or.reduce(outlier, axis=1)), _apart_note(read, off, outlier, what)
 
 
-def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[str, ...]]:
+def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelReadings, tuple[Remark, ...]]:
     """Mean rates (N, m) [rad/s] between the stamps of angles or ticks, with steering angles unchanged; and notes.
 
     Outliers among the angles are removed first. Jumps after which the angle continues from the new value, as of a
@@ -401,7 +402,9 @@ def _mean_rates(read: WheelReadings, wheels: Wheels, what: str) -> tuple[WheelRe
     wrong = second_order(off * dt, outlier)
     if wrong.any():
         at = read.stamps_ns[np.argmax(wrong)]
-        notes += (f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns.",)
+        sentence = f"{what}: {int(wrong.sum())} single readings are outliers and were removed, the first at {at} ns."
+        note = Remark("wheel_single_outliers", sentence)
+        notes += (note,)
         read = _some(read, ~wrong)
         off, outlier = apart(_steps(read, wheels, size), read.seconds[1:])
     outlier = set_back(_steps(read, wheels, size), off, outlier)
@@ -429,7 +432,7 @@ def _steps(read: WheelReadings, wheels: Wheels, size: float | None) -> np.ndarra
     return turned / (np.diff(read.stamps_ns)[:, None] * 1e-9)
 
 
-def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None, tuple[str, ...]]:
+def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None, tuple[Remark, ...]]:
     """Range after which angles [rad] or ticks wrap around, from the rig file or recognised from angles, with a note on
     the latter; None if they do not wrap around."""
     if wheels.measures == "ticks" or wheels.angle_range is not None:
@@ -437,10 +440,12 @@ def _range(read: WheelReadings, wheels: Wheels, what: str) -> tuple[float | None
     size = range_of(read.value[:, : _turning(read, wheels)])
     if size is None:
         return None, ()
-    return size, (
+    note = Remark(
+        "wheel_angles_wrap",
         f"{what}: the angles wrap around after {size:.6f} rad and were unwrapped; angle_range of {read.name} "
         "in the rig file sets another range.",
     )
+    return size, (note,)
 
 
 def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: str) -> None:
@@ -454,15 +459,18 @@ def _refuse_counter(read: WheelReadings, wheels: Wheels, off: np.ndarray, what: 
         )
 
 
-def _apart_note(read: WheelReadings, off: np.ndarray, outlier: np.ndarray, what: str) -> tuple[str, ...]:
+def _apart_note(read: WheelReadings, off: np.ndarray, outlier: np.ndarray, what: str) -> tuple[Remark, ...]:
     """A note on outliers: outlier (N, m) marks them, off (N, m) are the deviations from their neighbours."""
     count = int(outlier.any(axis=1).sum())
     if not count:
         return ()
     at, most = read.stamps_ns[np.argmax(outlier.any(axis=1))], np.abs(off[outlier]).max()
     return (
-        f"{what}: {count} of {len(outlier)} readings are outliers, off by up to {most:.3g}, and were removed, the "
-        f"first at {at} ns.",
+        Remark(
+            "wheel_outliers",
+            f"{what}: {count} of {len(outlier)} readings are outliers, off by up to {most:.3g}, and were removed, the "
+            f"first at {at} ns.",
+        ),
     )
 
 
@@ -522,15 +530,18 @@ def _refuse_twist_units(rate: np.ndarray, what: str) -> None:
         )
 
 
-def _gap_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
+def _gap_notes(stream: WheelStream, what: str) -> tuple[Remark, ...]:
     step = np.diff(stream.stamps_ns) * 1e-9
     gap = step > max(_GAP_STEPS * float(np.median(step)), _GAP_S)
     if not gap.any():
         return ()
     i = int(np.argmax(step))
     return (
-        f"{what}: {int(gap.sum())} gaps in the readings, the longest of {step[i]:.3g} s from "
-        f"{stream.stamps_ns[i]} ns on; in a gap only the mean rate is known.",
+        Remark(
+            "wheel_reading_gaps",
+            f"{what}: {int(gap.sum())} gaps in the readings, the longest of {step[i]:.3g} s from "
+            f"{stream.stamps_ns[i]} ns on; in a gap only the mean rate is known.",
+        ),
     )
 
 
@@ -552,9 +563,9 @@ _COLUMNS = {
 _UNITS = {"pair": ("rad/s", "rad/s"), "steered": ("rad/s", "rad"), "twist": ("m/s", "rad/s")}
 
 
-def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
+def _stuck_notes(stream: WheelStream, what: str) -> tuple[Remark, ...]:
     """Notes on a column that stays constant for longer than _STUCK_S while the other one changes."""
-    notes: list[str] = []
+    notes: list[Remark] = []
     for column, (name, but, moving) in enumerate(_COLUMNS[stream.kind]):
         other = 1 - column
         same = np.concatenate([[False], np.diff(stream.rate[:, column]) == 0])
@@ -566,10 +577,11 @@ def _stuck_notes(stream: WheelStream, what: str) -> tuple[str, ...]:
         if duration > _STUCK_S:
             unit = _UNITS[stream.kind][column]
             report = "reports" if "wheel" in name else "stays at"
-            notes.append(
+            sentence = (
                 f"{what}: {name} {report} {stream.rate[begin, column]:.4g} {unit} for {duration:.3g} s from "
                 f"{stream.stamps_ns[begin]} ns on while {but}."
             )
+            notes.append(Remark("wheel_reading_constant", sentence))
     return tuple(notes)
 
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
@@ -50,14 +51,15 @@ def keyframe_instants(inputs: Inputs, state: State) -> Iterator[tuple[str, np.nd
     yield from ((c.key, instants(c, state.values)) for c in inputs.measurements.cameras)
 
 
-def value_warnings(groups: Sequence[ParameterGroup]) -> Iterator[str]:
+def value_warnings(groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
     """A sentence for each camera whose edge bloom is too large for overexposure or ink."""
     for g in groups:
         if g.name == BLOOM.name and abs(g.value[0]) > LARGE_BLOOM_PX:
             where = "in" if g.value[0] > 0.0 else "out"
-            yield (
+            yield Remark(
+                "corners_shifted_on_tags",
                 f"the corners of {g.sensor} lie {abs(g.value[0]):.1f} px too far {where} on their tags, more than "
-                "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target."
+                "light and ink do; check tag_size and tag_spacing (the gap over tag_size) of the target.",
             )
 
 
@@ -79,26 +81,28 @@ MANY_REJECTED_SHARE = 0.05  # of the corners or tracks of a camera, above which 
 FEW_ON_PLANES_SHARE = 0.1
 
 
-def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[str]:
+def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """A sentence if `points_on_planes_m` is set, but no or few tracked points lie on planes of LiDARs."""
     yield from _plane_warnings(inputs.rig, estimate.problem.factors)
 
 
-def _plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
+def _plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[Remark]:
     """A sentence if `points_on_planes_m` is set, but no tracked points lie on planes, or too few to exclude chance."""
     if rig.settings.points_on_planes_m == 0.0:
         return
     features = of_type(factors, FeatureFactor)
     on, tracks = sum(int((f.on.plane >= 0).sum()) for f in features), sum(f.tracks.count for f in features)
     if on == 0:
-        yield (
+        yield Remark(
+            "no_tracked_points_on_planes",
             "no tracked points lie on planes of the LiDARs, so points_on_planes_m in the rig file has no effect; make "
-            "it larger, or remove it if little is flat."
+            "it larger, or remove it if little is flat.",
         )
     elif on < FEW_ON_PLANES_SHARE * tracks:
-        yield (
+        yield Remark(
+            "few_tracked_points_on_planes",
             f"only {on} of the {tracks} tracks that cameras follow lie on planes of the LiDARs, so few that it may be "
-            "chance; make points_on_planes_m in the rig file larger, or take it out where little is flat."
+            "chance; make points_on_planes_m in the rig file larger, or take it out where little is flat.",
         )
 
 
@@ -108,18 +112,19 @@ def unreliable(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[str]:
         yield ON_PLANES
 
 
-def many_rejected(fits: Sequence[SensorFit]) -> Iterator[str]:
+def many_rejected(fits: Sequence[SensorFit]) -> Iterator[Remark]:
     """A sentence for each camera of which many corners or tracks are rejected."""
     for f in fits:
         if f.kind in ("corners", "features") and f.rejected > MANY_REJECTED_SHARE * 0.5 * f.count:
             share = f.rejected / (f.rejected + 0.5 * f.count)
-            yield (
+            yield Remark(
+                "many_outliers_rejected",
                 f"{share:.0%} of the {f.kind} of {f.sensor} are rejected as outliers; look at its residuals in the "
-                "report."
+                "report.",
             )
 
 
-def overstated_noise(rig: Rig, fits: Sequence[SensorFit]) -> Iterator[str]:
+def overstated_noise(rig: Rig, fits: Sequence[SensorFit]) -> Iterator[Remark]:
     """A sentence that names all cameras whose stated corner noise is too large.
 
     The trajectory then follows the IMU, and its residuals become small, too."""
@@ -127,33 +132,37 @@ def overstated_noise(rig: Rig, fits: Sequence[SensorFit]) -> Iterator[str]:
     small = [f for f in fits if f.kind == "corners" and f.sensor in stated and is_small(f)]
     if small:
         sizes = " and ".join(f"{f.sensor} {ratio(f):.2g}x" for f in small)
-        yield (
+        yield Remark(
+            "corner_noise_overstated",
             f"residuals of corners are smaller than corner_noise predicts ({sizes}); standard deviations are too "
-            "large. Leave corner_noise out, and it is estimated."
+            "large. Leave corner_noise out, and it is estimated.",
         )
 
 
-def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> str | None:
+def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if residuals are larger than the stated noise predicts, or corners fit worse than
     `POOR_CORNER_RMS_PX`; else None. f: fit of corners or of points on planes."""
     if f.kind == ON_PLANES and excess(f) > 1.0:
-        return (
+        return Remark(
+            "tracked_points_off_planes",
             f"tracked points of {f.sensor} lie {times(f)} farther from planes of the LiDARs than points_on_planes_m "
-            "predicts; make it larger, or take it out where little is flat."
+            "predicts; make it larger, or take it out where little is flat.",
         )
     if f.kind != "corners":
         return None
     if f.rms is not None and f.rms > POOR_CORNER_RMS_PX:
-        return (
+        return Remark(
+            "corners_fit_poorly",
             f"the corners of {f.sensor} fit to {f.rms:.1f} px only, ten times the error of a detector, and the cause "
             "is unknown. Check its camera model, fixed intrinsics, its topic, the target in the rig file, jumps of its "
-            "clock, and blur of its images."
+            "clock, and blur of its images.",
         )
     if excess(f) > 1.0 and camera.corner_noise_px is not None:
-        return (
+        return Remark(
+            "corner_noise_understated",
             f"residuals of the corners of {f.sensor} are {times(f)} larger than its corner_noise predicts, and the "
             "cause is unknown. Check its camera model, fixed intrinsics and its topic; if all are right, leave "
-            "corner_noise out, and it is estimated."
+            "corner_noise out, and it is estimated.",
         )
     return None
 
@@ -220,13 +229,14 @@ def _shutter(factor: CornerFactor, out: CornerOutput, state: State, rows: int) -
     return _Shutter(factor.name, -along / square, gain / float(np.vdot(residual, residual)), gain)
 
 
-def _shutter_words(s: _Shutter) -> str:
+def _shutter_words(s: _Shutter) -> Remark:
     """A sentence on a rolling shutter."""
-    return (
+    return Remark(
+        "rolling_shutter",
         f"{s.camera} has a rolling shutter: corner residuals follow row times image speed, as if its rows were exposed "
         f"over {1e3 * abs(s.seconds):.2g} ms or more, which explains {s.share:.0%} of their squares. Every row is "
         "taken as exposed at the stamp. Use a global shutter or a mode that reads out faster; or stop at each view, "
-        "and calibrate pictures of the stops without the IMU."
+        "and calibrate pictures of the stops without the IMU.",
     )
 
 
@@ -283,13 +293,14 @@ def image_velocity(
     return np.where(known[:, None], velocity, 0.0), known
 
 
-def _words(lag: _Lag) -> str:
+def _words(lag: _Lag) -> Remark:
     """A sentence that two cameras are not exposed together."""
     first, second = (lag.first, lag.second) if lag.seconds > 0.0 else (lag.second, lag.first)
-    return (
+    return Remark(
+        "cameras_not_simultaneous",
         f"{first} and {second} are not exposed together: residuals follow the image speed, as if {second} were about "
         f"{1e3 * abs(lag.seconds):.0f} ms late. Trigger the cameras together, hold the rig still for each pair of "
-        "images, or record an IMU too: each camera then has a time offset of its own."
+        "images, or record an IMU too: each camera then has a time offset of its own.",
     )
 
 
@@ -307,9 +318,10 @@ def swapped_cameras(cameras: Sequence[Camera], groups: Sequence[ParameterGroup])
         distances = _distance(a, estimates, a.name), _distance(b, estimates, b.name)
         crossed_distances = _distance(a, estimates, b.name), _distance(b, estimates, a.name)
         if max(distances) > FAR and max(crossed_distances) < MUCH_NEARER * max(distances):
-            sentence = (
+            sentence = Remark(
+                "cameras_swapped",
                 f"{a.name} and {b.name} seem to be swapped: the pose and lens of each fit what the rig file gives of "
-                "the other. Correct their topics or paths, or the values in the rig file."
+                "the other. Correct their topics or paths, or the values in the rig file.",
             )
             yield Cause(sentence, np.inf, True)
 
@@ -333,7 +345,7 @@ MAX_NAMED_IMAGES = 10  # images that one sentence lists
 N_LATER_VIEWS = 10  # later views of a feature, for which a note states the track noise as well
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[str]:
+def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """Sentences on noise and outliers of corners and tracks, and on images that are left out."""
     if words := words_on_left_out(inputs.bodies):
         yield words
@@ -347,7 +359,7 @@ def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[st
     yield from _feature_notes(estimate)
 
 
-def _outside_imu_notes(inputs: Inputs, estimate: Estimate, factors: Sequence[CornerFactor]) -> Iterator[str]:
+def _outside_imu_notes(inputs: Inputs, estimate: Estimate, factors: Sequence[CornerFactor]) -> Iterator[Remark]:
     """Sentences on images that were taken while the IMU was not running."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
@@ -355,39 +367,43 @@ def _outside_imu_notes(inputs: Inputs, estimate: Estimate, factors: Sequence[Cor
         t = instants(camera.stream, estimate.outcome.state.values)
         left_out = int((~usable(inputs.imu, t, inputs.rig.settings.max_gap_s)).sum())
         if left_out:
-            yield f"{left_out} images of {camera.name} are left out: {inputs.imu.name} was not running then."
+            sentence = f"{left_out} images of {camera.name} are left out: {inputs.imu.name} was not running then."
+            yield Remark("images_outside_imu", sentence)
 
 
 def _corner_notes(
     camera: Camera, factor: CornerFactor, model: NoiseModel, late: np.ndarray, estimate: Estimate
-) -> Iterator[str]:
+) -> Iterator[Remark]:
     """Sentences on noise, outliers and circle centres of one camera. late (M,) bool: images rejected as a whole."""
     if not len(factor.stream.uv):
         return
-    yield f"{camera.name}: {_noise_words(model)}."
+    yield Remark("corner_noise_estimated", f"{camera.name}: {_noise_words(model)}.")
     if model.rate:
-        yield (
+        yield Remark(
+            "image_clock_corrected",
             f"the clock of {camera.name}, whose stamps jitter, is corrected by {1e6 * model.rate:+.0f} ppm, by the "
-            "other sensors."
+            "other sensors.",
         )
     if model.jitter_std > 0.0:
-        yield (
+        yield Remark(
+            "image_stamps_jitter",
             f"the stamps of {camera.name} jitter by {1e3 * model.jitter:.2g} +- {1e3 * model.jitter_std:.1g} ms "
             "(standard deviation), by the residuals along the image velocity; the standard deviations take it into "
-            "account. Let the camera stamp its images for a better result."
+            "account. Let the camera stamp its images for a better result.",
         )
     if words := _rejected_words(factor.keep[~late[factor.stream.image]]):
-        yield f"{camera.name}: {words}"
+        yield Remark("corners_rejected", f"{camera.name}: {words}")
     if factor.bodies.target.radii.any():
         size = np.linalg.norm(centre_shifts(factor, estimate.outcome.state), axis=1)
-        yield (
+        yield Remark(
+            "circle_centres_shifted",
             f"{camera.name}: ellipses have their centres {np.sqrt((size**2).mean()):.3f} px (RMS, {size.max():.2f} px "
-            "at most) beside the projected centres of their circles; the estimate takes it into account."
+            "at most) beside the projected centres of their circles; the estimate takes it into account.",
         )
 
 
-def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> str:
-    """A sentence on the images that were rejected because they are not simultaneous; "" if there are none.
+def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> Remark | None:
+    """A sentence on the images that were rejected because they are not simultaneous; None if there are none.
 
     apart: for each camera (M,) bool, its rejected images. All images at one keyframe are a set; its first image names
     the set.
@@ -399,12 +415,13 @@ def late_words(cameras: Sequence[CornerFactor], apart: Sequence[np.ndarray]) -> 
         for keyframe, stamp in zip(camera.keyframe[late].tolist(), camera.stream.stamps_ns[late].tolist(), strict=True):
             first_of.setdefault(keyframe, camera.stream.which(stamp))
     if not first_of:
-        return ""
+        return None
     named = ", ".join(first_of[keyframe] for keyframe in sorted(first_of)[:MAX_NAMED_IMAGES])
     which = f", the first {MAX_NAMED_IMAGES}" if len(first_of) > MAX_NAMED_IMAGES else ""
-    return (
+    return Remark(
+        "images_not_simultaneous",
         f"{len(first_of)} sets of images of {' and '.join(names)} were not exposed together, or the rig moved between, "
-        f"and are left out{which}: {named}."
+        f"and are left out{which}: {named}.",
     )
 
 
@@ -434,22 +451,24 @@ def _noise_words(model: NoiseModel) -> str:
     return words
 
 
-def _feature_notes(estimate: Estimate) -> Iterator[str]:
+def _feature_notes(estimate: Estimate) -> Iterator[Remark]:
     """Sentences on the number of feature tracks, their planes and their noise; none without tracks."""
     pairs = pairs_of(estimate.problem.factors, estimate.outcome.residuals, FeatureFactor)
     if not pairs:
         return
     factor, out = pairs[0]
     all_of_them = len(np.unique(np.concatenate([s.feature for s in factor.streams])))
-    yield (
+    yield Remark(
+        "feature_tracks_used",
         f"{all_of_them} points of the scene were followed, in {factor.tracks.count} tracks that show where they are; "
-        "tracks that do not, for lack of parallax, are left out."
+        "tracks that do not, for lack of parallax, are left out.",
     )
     if factor.surfaces is not None:
         plane = factor.on.plane[factor.on.plane >= 0]
-        yield (
+        yield Remark(
+            "tracks_on_planes",
             f"{len(plane)} of the tracks lie on {len(np.unique(plane))} planes that LiDARs see, to within "
-            f"{1e3 * factor.surfaces.noise:.1f} mm, as the rig file has it."
+            f"{1e3 * factor.surfaces.noise:.1f} mm, as the rig file has it.",
         )
     for camera, noise, root, stream in zip(factor.cameras, factor.noise, out.root, factor.streams, strict=True):
         share = f"{int((root > 0.0).sum())} of {len(stream.uv)}"
@@ -457,7 +476,8 @@ def _feature_notes(estimate: Estimate) -> Iterator[str]:
         if noise.growth > 0.0:
             last = float(noise.sigma * np.sqrt(1.0 + noise.growth * N_LATER_VIEWS))
             grows = f" in the first view, {last:.3f} px after {N_LATER_VIEWS} more"
-        yield f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
+        sentence = f"{camera.name}: track noise {noise.sigma:.3f} px{grows}; {share} observations of tracks are in use."
+        yield Remark("track_noise_estimated", sentence)
 
 
 # Residuals of cameras that a result keeps: of corners of the target, and of feature tracks.

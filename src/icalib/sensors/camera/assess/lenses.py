@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
@@ -106,7 +107,12 @@ def wrong_models(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
         if best is not None and current is not None:
             yield Cause(_named_model(misfit, current, best, camera), gain)
         elif noise.lens.rms > noise.base:
-            yield Cause(f"{misfit}{NO_BETTER_MODEL if current is not None else ''}{CHECK_IMAGES}", gain)
+            yield Cause(
+                Remark(
+                    "lens_misfit_unexplained", f"{misfit}{NO_BETTER_MODEL if current is not None else ''}{CHECK_IMAGES}"
+                ),
+                gain,
+            )
 
 
 def worst_regions(uv: np.ndarray, field: np.ndarray, resolution: tuple[int, int]) -> str:
@@ -120,13 +126,14 @@ def worst_regions(uv: np.ndarray, field: np.ndarray, resolution: tuple[int, int]
     return " and ".join(REGIONS[k // 3][k % 3] for k in order[:count])
 
 
-def _named_model(misfit: str, current: _Trial, best: _Trial, camera: Camera) -> str:
+def _named_model(misfit: str, current: _Trial, best: _Trial, camera: Camera) -> Remark:
     """The sentence about a `misfit` that the model `best` explains."""
     old = " and ".join(name for name in LENS if getattr(camera, name).value is not None)
     remove = f", and remove {old}, of {current.model.name}" if old else ""  # another model has other numbers
-    return (
+    return Remark(
+        "lens_model_wrong",
         f"{misfit}: {current.model.name} does not follow this lens. In images that had no part in the fit it leaves "
-        f"{current.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`{remove}."
+        f"{current.rms:.2g} px, {best.model.name} {best.rms:.2g} px; write `model: {best.model.name}`{remove}.",
     )
 
 
@@ -249,7 +256,7 @@ OTHER_FOCAL = 0.02  # relative difference of fx: sets that differ by less count 
 MOST_CHI2 = 16.0  # sum over all observations of the squared difference over the noise: four standard deviations
 
 
-def ambiguities(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -> Iterator[str]:
+def ambiguities(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -> Iterator[Remark]:
     """One sentence for each camera whose observations fit another set of parameters as well."""
     for camera, factor in zip(inputs.rig.cameras, of_type(estimate.problem.factors, CornerFactor), strict=True):
         fit = next((f for f in fits if f.sensor == camera.name and f.unit == "px" and f.rms), None)
@@ -261,9 +268,10 @@ def ambiguities(inputs: Inputs, estimate: Estimate, fits: Sequence[SensorFit]) -
         twin = twin_lens(factor.model, lens, uv, float(limit))
         if twin is not None:
             numbers = ", ".join(f"{n} {x:.4g}" for n, x in zip(factor.model.parameter_names, twin, strict=True))
-            yield (
+            yield Remark(
+                "second_lens_fits",
                 f"{camera.name}: the images fit a second set of parameters of {factor.model.name} as well: {numbers}. "
-                "Both are the same lens within the noise; use the parameters of one set together."
+                "Both are the same lens within the noise; use the parameters of one set together.",
             )
 
 
@@ -338,9 +346,10 @@ def wrong_lenses(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -> 
                 if v is not None and max(abs(value + lens_step.step - v)) < NEARER * max(off)
             ]
             hint = f" Those of {nearer[0]} are nearer." if nearer else ""
-            sentence = (
+            sentence = Remark(
+                "fixed_intrinsics_wrong",
                 f"the intrinsics of {lens_step.camera} that the rig file fixes do not fit its images, which want "
-                f"{where}: check that they are this camera's, at this resolution, or leave them free.{hint}"
+                f"{where}: check that they are this camera's, at this resolution, or leave them free.{hint}",
             )
             gain = float(((lens_step.step / lens_step.std) ** 2).max())
             yield Cause(sentence, gain, True, tuple((lens_step.camera, name) for name in LENS))
@@ -400,9 +409,10 @@ def wrong_resolutions(inputs: Inputs, estimate: Estimate, groups: Sequence[Param
             continue
         if (size := smaller_image(camera.resolution, g.value[2:4], g.std[2:4], uv)) is not None:
             stated, apparent = (f"{width} x {height}" for width, height in (camera.resolution, size))
-            sentence = (
+            sentence = Remark(
+                "resolution_wrong",
                 f"the resolution of {camera.name} is wrong: its principal point and all observations are those of "
-                f"images of about {apparent} px, not {stated}. Correct its resolution in the rig file."
+                f"images of about {apparent} px, not {stated}. Correct its resolution in the rig file.",
             )
             yield Cause(sentence, np.inf, True)
 

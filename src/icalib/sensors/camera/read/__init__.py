@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.images import Note, ignore
 from icalib.data.messages import HasMessages, MessageType, UnreadType
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
@@ -199,7 +200,7 @@ def _corners(recording: Recording, cameras: Sequence[Camera], reading: Reading) 
     return streams
 
 
-def _image_corners(recording: Recording, camera: Camera, reading: Reading) -> tuple[CornerStream, tuple[str, ...]]:
+def _image_corners(recording: Recording, camera: Camera, reading: Reading) -> tuple[CornerStream, tuple[Remark, ...]]:
     """Target corners in the images of the camera, with notes."""
     rig, names = reading.rig, [c.name for c in reading.rig.of(Camera)]
 

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import CornerStream, TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.data.stamps import EvenStamps, even_stamps, followed, rate_sentence, stamp_scatter
@@ -63,7 +64,7 @@ Sample = Callable[[], list[np.ndarray]]  # some images of the recording (h, w) u
 
 def find_corners(
     recording: Recording, camera: Camera, target: Target, keep: bool = True, progress: Progress = lambda _: None
-) -> tuple[CornerStream, tuple[str, ...]]:
+) -> tuple[CornerStream, tuple[Remark, ...]]:
     """The target's corners in all images of `camera`, and sentences on images, tags and corners that were left out.
 
     With `keep`, corners of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
@@ -91,7 +92,7 @@ def find_corners(
     corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
     damaged = sorted(files.keys() - set(stamps_ns.tolist()))
     notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, files))
-    return corners, tuple(f"{where}: {note}" for note in notes)
+    return corners, tuple(note.saying(f"{where}: {note}") for note in notes)
 
 
 def _called(target: Target) -> str:
@@ -217,7 +218,7 @@ def camera_images(recording: Recording, camera: Camera, files: dict[int, str]) -
 
 # Even stamps of images that a computer stamps on arrival, although the camera takes them evenly.
 
-ReadImages = tuple[CornerStream | TrackStream, tuple[str, ...]]  # a stream, and notes for the user
+ReadImages = tuple[CornerStream | TrackStream, tuple[Remark, ...]]  # a stream, and notes for the user
 _MIN_SHARED = 0.5  # of the images of a camera have stamps of another one, if both are triggered together
 
 
@@ -287,7 +288,7 @@ _MAX_OUTSIDE_SHARE = 0.1  # of all points; more points outside mean that the sta
 
 def checked_corners(
     corners: CornerStream, where: str, resolution: tuple[int, int]
-) -> tuple[CornerStream, tuple[str, ...]]:
+) -> tuple[CornerStream, tuple[Remark, ...]]:
     """The corners inside the image of `resolution` (width, height) px, in images with four or more; notes on others.
 
     Raises RecordingError naming `where` (the file or topic) if there are no usable images, many corners are outside the
@@ -304,7 +305,7 @@ def checked_corners(
     return corners, outside + poor
 
 
-def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[str, ...]]:
+def _inside(corners: CornerStream, what: str, resolution: tuple[int, int]) -> tuple[CornerStream, tuple[Remark, ...]]:
     """The corners inside the image, and a note on corners outside. Raises RecordingError if many are outside."""
     inside = in_image(corners.uv, resolution, _CORNER_MARGIN_PX)
     if inside.all():
@@ -336,7 +337,7 @@ def in_image(uv: np.ndarray, resolution: tuple[int, int], margin_px: float) -> n
 
 def outside_note(
     stream: CornerStream | TrackStream, inside: np.ndarray, point: str, what: str, resolution: tuple[int, int]
-) -> str:
+) -> Remark:
     """A note on points that are not `inside` (N,) bool the image, at least one. `point`: text that names the first.
 
     Raises RecordingError if many points are outside."""
@@ -347,10 +348,10 @@ def outside_note(
     sentence = f"{what}: in the image {which}, {words}"
     if count > _MAX_OUTSIDE_SHARE * len(inside):
         raise RecordingError(f"{sentence}; check the camera's resolution [width, height] in the rig file.")
-    return f"{sentence}; {count} of {len(inside)} such points were left out."
+    return Remark("points_outside_image", f"{sentence}; {count} of {len(inside)} such points were left out.")
 
 
-def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[str, ...]]:
+def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream, tuple[Remark, ...]]:
     """The images with enough corners for a pose, and a note on others. Raises RecordingError if none has enough."""
     count = np.diff(corners.start)
     keep = count >= _MIN_IMAGE_CORNERS
@@ -361,7 +362,7 @@ def _without_poor_images(corners: CornerStream, what: str) -> tuple[CornerStream
     rows = keep[corners.image]
     first = int(corners.stamps_ns[np.argmin(keep)])
     dropped = f"{int((~keep).sum())} images with fewer than {_MIN_IMAGE_CORNERS} corners were dropped"
-    note = f"{what}: {dropped}, the first {corners.which(first)}."
+    note = Remark("images_with_few_corners", f"{what}: {dropped}, the first {corners.which(first)}.")
     return corners.of_rows(rows, corners.stamps_ns[keep], count[keep]), (note,)
 
 

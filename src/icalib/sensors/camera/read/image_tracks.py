@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from icalib.base.extras import load_cv2
+from icalib.base.remark import Remark
 from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.detection.images import (
@@ -81,7 +82,7 @@ class _TrackArrays:
 
 def find_all_tracks(
     recording: Recording, cameras: Sequence[Camera], keep: bool = True, progress: Progress = lambda _: None
-) -> list[tuple[TrackStream, tuple[str, ...]]]:
+) -> list[tuple[TrackStream, tuple[Remark, ...]]]:
     """Feature tracks of each of the cameras, and sentences on rejected points. A feature number is the same point in
     all cameras; pairs of cameras with a common field of view share features. Raises RecordingError as `find_tracks`."""
     by_camera = []
@@ -94,7 +95,7 @@ def find_all_tracks(
 
 def find_tracks(
     recording: Recording, camera: Camera, keep: bool = True, progress: Progress = lambda _: None
-) -> tuple[TrackStream, tuple[str, ...]]:
+) -> tuple[TrackStream, tuple[Remark, ...]]:
     """Feature tracks of all images of `camera`, numbered from 0, and sentences on images and points that were left out.
 
     With `keep`, tracks of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
@@ -116,7 +117,7 @@ def find_tracks(
         if keep:
             keep_arrays(key, {name: np.asarray(getattr(tracks, name)) for name in (*_COLUMNS, *_COUNTS)})
     stream = _stream(camera.name, tracks, where)
-    return stream, tuple(f"{where}: {note}" for note in _notes(tracks, files))
+    return stream, tuple(note.saying(f"{where}: {note}") for note in _notes(tracks, files))
 
 
 def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _TrackArrays:
@@ -229,16 +230,18 @@ def _stream(name: str, tracks: _TrackArrays, where: str) -> TrackStream:
     )
 
 
-def _notes(tracks: _TrackArrays, files: dict[int, str]) -> Iterator[str]:
+def _notes(tracks: _TrackArrays, files: dict[int, str]) -> Iterator[Remark]:
     """Sentences on damaged images, and on points that were rejected because they move or stay in place."""
     yield from words_on_damaged(tracks.damaged_ns.tolist(), files)
     count = len(np.unique(tracks.feature)) + tracks.moving + tracks.in_place
     if tracks.moving > NOTED * count:
-        yield f"{tracks.moving} of {count} points do not fit a single motion of the camera and were rejected."
+        sentence = f"{tracks.moving} of {count} points do not fit a single motion of the camera and were rejected."
+        yield Remark("tracked_points_moving", sentence)
     if tracks.in_place > NOTED * count:
-        yield (
+        yield Remark(
+            "tracked_points_fixed_in_image",
             f"{tracks.in_place} of {count} points keep their place in the image while the camera turns, as if "
-            "on the robot or on a dirty lens; they were rejected."
+            "on the robot or on a dirty lens; they were rejected.",
         )
 
 

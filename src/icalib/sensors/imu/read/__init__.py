@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.messages import MessageType, TopicInfo, choose_topic
 from icalib.data.recording import Cut, Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import ClockJumps, kept_readings, longest_run
@@ -94,7 +95,7 @@ def _carried(bag: HasImuMessages, topic: str) -> str:
     return "both" if rates == forces else "gyro" if rates else "accel"
 
 
-def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[Remark, ...]]:
     """The readings of both sensors in one stream, and notes if they had to be joined.
 
     Raises RecordingError if a separate sensor has too few finite readings, if its stamps are out of order, or if the
@@ -103,7 +104,7 @@ def one_stream(imu: ImuStream | ImuHalves, what: str) -> tuple[ImuStream, tuple[
     return (imu, ()) if isinstance(imu, ImuStream) else _joined(imu, what)
 
 
-def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[Remark, ...]]:
     """One stream at the gyroscope's stamps within the time common to both, with the accelerometer interpolated
     linearly; and notes. Raises RecordingError as `kept_readings`, and if the two overlap too little."""
     gyro_ns, gyro, gyro_notes = _checked_half(halves.gyro_ns, halves.gyro, "gyroscope", what)
@@ -117,24 +118,27 @@ def _joined(halves: ImuHalves, what: str) -> tuple[ImuStream, tuple[str, ...]]:
     gyro_ns, gyro = gyro_ns[common], gyro[common]
     at, known = ((x - accel_ns[0]).astype(np.float64) for x in (gyro_ns, accel_ns))
     accel = np.stack([np.interp(at, known, accel[:, k]) for k in range(3)], axis=1)
-    note = (
+    note = Remark(
+        "imu_stamps_separate",
         f"{what}: gyroscope and accelerometer have separate stamps; {len(known)} readings of the accelerometer "
-        f"were interpolated to {len(at)} stamps of the gyroscope."
+        f"were interpolated to {len(at)} stamps of the gyroscope.",
     )
     return ImuStream(halves.name, gyro_ns, gyro, accel), (*gyro_notes, *accel_notes, note)
 
 
 def _checked_half(
     stamps_ns: np.ndarray, values: np.ndarray, kind: str, what: str
-) -> tuple[np.ndarray, np.ndarray, tuple[str, ...]]:
+) -> tuple[np.ndarray, np.ndarray, tuple[Remark, ...]]:
     """Stamps [ns] and values of the finite readings of gyroscope or accelerometer (`kind`), without repetitions; and
     notes. Raises RecordingError for fewer than two readings, and as `kept_readings`."""
     finite = np.isfinite(values).all(axis=1)
     if finite.sum() < 2:
         raise RecordingError(f"{what}: the {kind} has only {len(stamps_ns)} readings; record it as long as the rest.")
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     if not finite.all():
-        notes = (f"{what}, {kind}: {int((~finite).sum())} readings are not finite and were left out.",)
+        sentence = f"{what}, {kind}: {int((~finite).sum())} readings are not finite and were left out."
+        note = Remark("imu_parts_not_finite", sentence)
+        notes = (note,)
         stamps_ns, values = stamps_ns[finite], values[finite]
     remedy = "export the IMU's own stamps"
     kept, more = kept_readings(stamps_ns, values, f"{what}, {kind}", RATE_HZ, "reading", remedy)
@@ -199,7 +203,7 @@ def read(recording: Recording, sensors: Sequence[ImuSensor], reading: Reading) -
     return [read_imu(recording, sensor, reading.cut) for sensor in sensors]
 
 
-def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStream, tuple[str, ...]]:
+def read_imu(recording: Recording, sensor: ImuSensor, cut: Cut) -> tuple[ImuStream, tuple[Remark, ...]]:
     """Valid readings of one IMU in SI units within the time range that `cut` keeps, and notes for the user. Raises
     RecordingError as `readings`, `one_stream` and `checked_imu`."""
     where = recording.where(sensor)
@@ -285,12 +289,12 @@ def in_si(imu: ImuStream, sensor: ImuSensor) -> ImuStream:
     return replace(imu, gyro=in_axes(gyro, sensor.gyro_axes), accel=in_axes(accel, sensor.accel_axes))
 
 
-def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tuple[ImuStream, tuple[str, ...]]:
+def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tuple[ImuStream, tuple[Remark, ...]]:
     """The readings with accelerations in m/s^2, and a note if gravity shows that they were in g.
 
     Raises RecordingError if the readings contain no gravity, or if the unit of acceleration or angular rate is wrong.
     """
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     median = float(np.median(np.linalg.norm(imu.accel, axis=1)))
     if _is_in_g(imu, median):
         if sensor is not None and sensor.accel_unit is not None:
@@ -298,10 +302,12 @@ def recognised_unit(imu: ImuStream, what: str, sensor: ImuSensor | None) -> tupl
                 f"{what}: with accel_unit: {sensor.accel_unit} the accelerometer measures gravity as "
                 f"{median:.3g}, which looks like units of g; correct accel_unit in the rig file."
             )
-        notes = (
+        note = Remark(
+            "accelerometer_in_g",
             f"{what}: the accelerometer is in units of g (its median is {median:.3g}); its readings were "
             f"multiplied by {G_M_S2} m/s^2.",
         )
+        notes = (note,)
         imu = replace(imu, accel=G_M_S2 * imu.accel)
     elif _lacks_gravity(imu, median):
         raise RecordingError(
@@ -372,7 +378,7 @@ class Saturation:
     stamp_ns: int
 
 
-def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> tuple[ImuStream, tuple[str, ...]]:
+def checked_imu(imu: ImuStream, where: str, sensor: ImuSensor | None = None) -> tuple[ImuStream, tuple[Remark, ...]]:
     """`imu` with strictly increasing stamps in SI units; notes on dropped, converted and possibly saturated readings.
     `sensor` has the units and axes of the readings as stated in the rig file; None: they are recognised.
 
@@ -403,10 +409,13 @@ def _refuse_frozen(imu: ImuStream, what: str) -> None:
             raise RecordingError(f"{what}: the {kind} gives the same reading from start to end; check its driver.")
 
 
-def _saturation_notes(imu: ImuStream, what: str) -> tuple[str, ...]:
+def _saturation_notes(imu: ImuStream, what: str) -> tuple[Remark, ...]:
     return tuple(
-        f"{what}: the {s.kind} {s.axis} looks saturated, {s.count} readings in a row at {s.limit:.4g} from "
-        f"{s.stamp_ns} ns on; move more slowly, or set a wider range."
+        Remark(
+            "imu_saturated",
+            f"{what}: the {s.kind} {s.axis} looks saturated, {s.count} readings in a row at {s.limit:.4g} from "
+            f"{s.stamp_ns} ns on; move more slowly, or set a wider range.",
+        )
         for s in saturations(imu)
     )
 

@@ -8,8 +8,9 @@ from itertools import combinations
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import ImuStream
-from icalib.data.stamps import even_stamps, followed, true_runs, usual_step
+from icalib.data.stamps import even_stamps, followed, repeated_note, true_runs, usual_step
 from icalib.geometry import so3
 
 # Removes wrong readings of an IMU and corrects their stamps; notes tell the user about both.
@@ -18,14 +19,14 @@ _BEYOND = 1e12  # larger readings are invalid in any unit; squares of smaller on
 _SENSORS = ("gyroscope", "accelerometer")
 
 
-def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[Remark, ...]]:
     """Finite readings without copies, and notes. If copies were found, the other readings are sorted by stamp.
 
     Stamps in order that have bursts or jitter are replaced by even ones (`even_stamps`).
     """
     notes = _Notes(what, imu.stamps_ns)
     finite = np.all(np.abs(np.hstack([imu.gyro, imu.accel])) < _BEYOND, axis=1)
-    notes.left_out(~finite, f"are not finite, or beyond {_BEYOND:g},")
+    notes.left_out(~finite, Remark("imu_readings_not_finite", f"are not finite, or beyond {_BEYOND:g},"))
     imu = _some(imu, finite)
     if len(imu.stamps_ns) < 2:
         return imu, notes.sentences
@@ -37,7 +38,9 @@ def in_time(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
             again = copies(ordered.stamps_ns, values)
     if again.any():
         notes.stamps_ns = ordered.stamps_ns
-        notes.left_out(again, "are delayed copies of another reading, with a later stamp,")
+        notes.left_out(
+            again, Remark("imu_readings_copied", "are delayed copies of another reading, with a later stamp,")
+        )
         imu = _some(ordered, ~again)
     if (np.diff(imu.stamps_ns) >= 0).all():
         imu = _without_repeats(imu, notes)
@@ -55,13 +58,11 @@ def _without_repeats(imu: ImuStream, notes: _Notes) -> ImuStream:
     again = np.concatenate([[False], (row == 0).all(axis=1)])
     if again.any():
         first = imu.stamps_ns[np.argmax(again)]
-        notes.sentences += (
-            f"{notes.what}: {int(again.sum())} repeated readings were dropped, the first at {first} ns.",
-        )
+        notes.sentences += (repeated_note(notes.what, int(again.sum()), "readings", first),)
     return _some(imu, ~again)
 
 
-def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]]:
+def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[Remark, ...]]:
     """`imu` without outliers, and notes. A slower sensor whose readings the driver repeats is interpolated instead."""
     notes = _Notes(what, imu.stamps_ns)
     seconds, good = imu.seconds, np.ones(len(imu.stamps_ns), bool)
@@ -70,13 +71,16 @@ def without_wrong(imu: ImuStream, what: str) -> tuple[ImuStream, tuple[str, ...]
         if (new := new_values(values)) is not None:
             values = _interpolated(seconds, values, new)
             notes.sentences += (
-                f"{what}: the {kind} has a new value in only {int(new.sum())} of {len(new)} readings and "
-                "repeats it until the next one; the readings between were interpolated.",
+                Remark(
+                    "imu_sensor_slower",
+                    f"{what}: the {kind} has a new value in only {int(new.sum())} of {len(new)} readings and "
+                    "repeats it until the next one; the readings between were interpolated.",
+                ),
             )
         bad = impossible(values, kind == "gyroscope") | stuck(values)
         rest = np.flatnonzero(~bad)
         bad[rest[spikes(seconds[rest], values[rest])]] = True
-        notes.left_out(bad, f"are outliers of the {kind}, or repeat it exactly before a jump,")
+        notes.left_out(bad, Remark("imu_outliers", f"are outliers of the {kind}, or repeat it exactly before a jump,"))
         good &= ~bad
         repaired.append(values)
     if good.sum() < 2 or not notes.sentences:
@@ -88,18 +92,19 @@ class _Notes:
     """Collects sentences for the user about readings that were left out; stamps_ns (N,): stamps of all readings."""
 
     def __init__(self, what: str, stamps_ns: np.ndarray) -> None:
-        self.sentences: tuple[str, ...] = ()
+        self.sentences: tuple[Remark, ...] = ()
         self.stamps_ns = stamps_ns
         self.what, self._begin_ns = what, int(stamps_ns.min()) if len(stamps_ns) else 0
 
-    def left_out(self, bad: np.ndarray, why: str) -> None:
+    def left_out(self, bad: np.ndarray, why: Remark) -> None:
         if not bad.any():
             return
         first = int(self.stamps_ns[np.argmax(bad)])
-        self.sentences += (
+        sentence = (
             f"{self.what}: {int(bad.sum())} of {len(bad)} readings {why} and were left out, the first "
-            f"{(first - self._begin_ns) * 1e-9:.3f} s from the start, at {first} ns.",
+            f"{(first - self._begin_ns) * 1e-9:.3f} s from the start, at {first} ns."
         )
+        self.sentences += (why.saying(sentence),)
 
 
 def _some(imu: ImuStream, which: np.ndarray) -> ImuStream:

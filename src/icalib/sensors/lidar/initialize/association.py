@@ -17,6 +17,7 @@ from functools import partial
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import LidarStream
 from icalib.detection.planes import MOST_POINTS, ExtractedPlanes, PlaneSearch, find_planes
 from icalib.errors import EstimationError
@@ -209,10 +210,11 @@ def with_known_motion(inputs: Inputs, state: State) -> Inputs:
                 "clocks overlap, or the time_offset in the rig file."
             )
         if not known.all():
-            notes.append(
+            sentence = (
                 f"{np.count_nonzero(~known)} of {len(known)} scans of {stream.name} are ignored, because no "
                 "other sensor determines the motion at that time."
             )
+            notes.append(Remark("scans_without_motion", sentence))
         lidars.append(stream.some(np.repeat(known, np.diff(stream.start)) & are_somewhere(stream.xyz)))
     return replace(inputs, measurements=replace(measured.with_streams(*lidars), notes=tuple(notes)))
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.errors import EstimationError
 from icalib.geometry import so3
@@ -191,7 +192,7 @@ def _dilated(voxels: np.ndarray) -> np.ndarray:
     return grid.ravel()
 
 
-def _warning(stream: LidarStream, self_returns: np.ndarray) -> str:
+def _warning(stream: LidarStream, self_returns: np.ndarray) -> Remark:
     """The warning on self-returns `self_returns` (N,) bool: their share, distance and direction."""
     xyz = stream.xyz[self_returns].astype(np.float64)
     distance = np.linalg.norm(xyz, axis=1)
@@ -201,8 +202,9 @@ def _warning(stream: LidarStream, self_returns: np.ndarray) -> str:
     where = f"about azimuth {azimuth} deg, elevation {elevation} deg"
     if np.linalg.norm([x, y, z]) < MAX_MEAN_DIRECTION:
         where = "on all sides"
-    return (
+    return Remark(
+        "self_returns_removed",
         f"{stream.name} has self-returns: {self_returns.mean():.1%} of its points move with its frame, {low:.2f} to "
         f"{high:.2f} m away, {where}. They were removed; to remove them by distance instead, set min_range of "
-        f"{stream.name} to {high + 0.1:.1f} in the rig file, or mask them in its driver."
+        f"{stream.name} to {high + 0.1:.1f} in the rig file, or mask them in its driver.",
     )

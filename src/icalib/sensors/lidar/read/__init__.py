@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.base.files import HEAD_BYTES, load_arrays, not_data
+from icalib.base.remark import Remark
 from icalib.data.messages import MessageType, TopicInfo, UnreadType
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.tables import TableFile
@@ -143,7 +144,7 @@ def read_scan_stamps(path: Path) -> np.ndarray:
     return _of_kind(path, "stamps_ns", arrays["stamps_ns"], np.int64)
 
 
-def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def in_seconds(stream: LidarStream, lidar: Lidar, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """`stream` with point times in seconds, NaN for outliers, and a note on the unit. Works in place on the arrays of
     `stream`. Raises RecordingError if no unit fits."""
     scans = [stream.offset_s[a:b] for a, b in pairwise(stream.start.tolist()) if b > a]

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import LidarStream
 from icalib.data.messages import HasMessages
 from icalib.data.stamps import rate_sentence
@@ -59,7 +60,7 @@ Timing = Callable[
 ]  # (cloud, points (N, 3)) -> stamp [ns], times (N,) since it [s, or turns for azimuth]
 
 
-def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream of all usable points of `clouds`, and notes on rejected points and on point times. A scan may be
     empty. what: name of the topic in messages.
 
@@ -89,9 +90,11 @@ def read_clouds(clouds: Iterator[PointCloud], lidar: Lidar, what: str) -> tuple[
         period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
         np.multiply(stream.offset_s, np.float32(period_s), out=stream.offset_s)
     if others:
-        notes += (
+        note = Remark(
+            "clouds_lack_fields",
             f"{what}: {len(others)} clouds lack fields of the others and were left out, the first at {others[0]} ns.",
         )
+        notes += (note,)
     dropped = sieve.note(what)
     return stream, notes + ((dropped,) if dropped else ())
 
@@ -166,12 +169,15 @@ def _stamps(clouds: Sequence[PointCloud], what: str) -> np.ndarray:
     return stamps_ns
 
 
-def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[str, ...]]:
+def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timing, tuple[Remark, ...]]:
     """The function that computes stamp and point times of a cloud, chosen from the first clouds; and notes. Raises
     RecordingError if point times are not known."""
     stamps_ns = _stamps(clouds, what)
     if lidar.point_time == "snapshot":
-        note = f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored."
+        note = Remark(
+            "point_times_ignored",
+            f"{what}: all points of a cloud are taken at its stamp, as point_time says; motion within it is ignored.",
+        )
         return _at_the_stamp, (note,)
     if lidar.point_time == "azimuth":
         sweep = find_sweep([coordinates(cloud, what) for cloud in clouds])
@@ -181,7 +187,8 @@ def _timing(clouds: Sequence[PointCloud], lidar: Lidar, what: str) -> tuple[Timi
                 f"set point_time of {lidar.name} to snapshot in the rig file, or record a cloud with times."
             )
         turn = "counterclockwise" if sweep.direction > 0 else "clockwise"
-        note = f"{what}: point times are computed from the azimuth, {turn}, one turn per cloud, as point_time says."
+        sentence = f"{what}: point times are computed from the azimuth, {turn}, one turn per cloud, as point_time says."
+        note = Remark("point_times_by_azimuth", sentence)
         return partial(_by_azimuth, sweep), (note,)
     times, notes = find_point_times(what, stamps_ns, [cloud.points for cloud in clouds], lidar)
     first_ns, _ = _by_field(times, clouds[0], clouds[0].points)
@@ -297,7 +304,7 @@ class Sieve:
             self._dropped += [np.count_nonzero(reason) for reason in reasons]
         return kept
 
-    def note(self, what: str) -> str | None:
+    def note(self, what: str) -> Remark | None:
         """A sentence on the points left out of `what`, by reason; None if all were kept."""
         if not self._dropped.any():
             return None
@@ -309,7 +316,7 @@ class Sieve:
             "without a time within their scan",
         )
         parts = [f"{count} {why}" for count, why in zip(self._dropped, words, strict=True) if count]
-        return f"{what}: of {self._total} points {', '.join(parts)} were left out."
+        return Remark("lidar_points_unusable", f"{what}: of {self._total} points {', '.join(parts)} were left out.")
 
 
 def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
@@ -330,7 +337,7 @@ def sifted(stream: LidarStream, sieve: Sieve) -> LidarStream:
     return LidarStream(stream.name, stream.stamps_ns, start, *(column[:kept] for column in columns))
 
 
-def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[str, ...]]:
+def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """`stream` without scans that are empty, repeat a recent scan, or have a wrong stamp; and notes on these.
 
     Raises RecordingError naming `where` and the instant: fewer than two scans with points, a clock that was set back,
@@ -345,7 +352,9 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
         )
     notes = ()
     if not filled.all():
-        notes = (f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out.",)
+        sentence = f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out."
+        note = Remark("scans_empty", sentence)
+        notes = (note,)
         start = np.append(stream.start[:-1][filled], stream.start[-1])
         stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
     for check in (without_repeats, in_order, with_even_stamps, at_even_steps):
@@ -362,7 +371,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[s
     return stream, notes + more
 
 
-def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream without scans whose points are far in time from the stamp, and a note. Raises RecordingError if there
     are many such scans."""
     period_s = float(np.median(np.diff(stream.stamps_ns))) * 1e-9
@@ -376,9 +385,10 @@ def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tup
             f"but scans are {period_s:.4g} s apart; write point times relative to the stamp of the scan."
         )
     first = stream.stamps_ns[np.argmax(far)]
-    note = (
+    note = Remark(
+        "points_far_from_stamp",
         f"{what}: {int(far.sum())} of {len(far)} scans have points that are far from their stamp and were left out, "
-        f"the first at {first} ns."
+        f"the first at {first} ns.",
     )
     return selected(stream, np.flatnonzero(~far)), (note,)
 

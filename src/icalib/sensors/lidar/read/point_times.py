@@ -27,6 +27,7 @@ from math import floor
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import LidarStream
 from icalib.data.stamps import even_stamps
 from icalib.errors import RecordingError
@@ -100,7 +101,7 @@ def within_scan(times: np.ndarray, longest: float) -> np.ndarray:
 
 def find_point_times(
     what: str, stamps_ns: np.ndarray, scans: Sequence[np.ndarray], lidar: Lidar
-) -> tuple[PointTimes, tuple[str, ...]]:
+) -> tuple[PointTimes, tuple[Remark, ...]]:
     """Interpretation of point times, found from some scans: structured arrays of messages with stamps_ns (S,). Also a
     note if their unit is not the usual one of drivers.
 
@@ -120,7 +121,7 @@ def find_point_times(
 
 def unit_of_offsets(
     times: str, used: Sequence[np.ndarray], period_s: float, lidar: Lidar, usual: TimeUnit
-) -> tuple[TimeUnit, tuple[str, ...]]:
+) -> tuple[TimeUnit, tuple[Remark, ...]]:
     """Unit of relative times `used` of some scans with the period period_s: that of the rig file, else the usual one,
     else the only one that gives a plausible duration of scans, with a note. times: their name in messages.
 
@@ -144,7 +145,9 @@ def unit_of_offsets(
     if lidar.point_time_unit is not None:
         raise RecordingError(f"{spread}; set point_time_unit of {lidar.name} to {fitting[0]} in the rig file.")
     only = f"they are read as {fitting[0]}, the only unit that fits"
-    return fitting[0], (f"{spread}; {only}; point_time_unit of {lidar.name} in the rig file may say otherwise.",)
+    sentence = f"{spread}; {only}; point_time_unit of {lidar.name} in the rig file may say otherwise."
+    note = Remark("point_time_unit_recognised", sentence)
+    return fitting[0], (note,)
 
 
 def likely_fields(scans: Sequence[np.ndarray]) -> list[str]:
@@ -153,15 +156,16 @@ def likely_fields(scans: Sequence[np.ndarray]) -> list[str]:
     return [n for n in _differing(scans) if _LIKE_A_TIME.search(n) and n not in FIELDS]
 
 
-def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> str | None:
+def clock_note(what: str, times: PointTimes, stamp_ns: int, first_ns: int) -> Remark | None:
     """A sentence if the clock of point times differs from that of the message stamps, else None. stamp_ns: stamp of a
     message; first_ns: time of its first point."""
     if not times.absolute or times.point_time != "auto" or abs(first_ns - stamp_ns) < 1_000_000_000:
         return None
-    return (
+    return Remark(
+        "point_clock_differs",
         f"{what}: the point times `{times.field}` are from another clock than the message stamps, "
         f"{(stamp_ns - first_ns) * 1e-9:.3f} s behind. The clock of the points is used, and time_offset refers "
-        "to it."
+        "to it.",
     )
 
 
@@ -348,7 +352,7 @@ _ISOLATED_S = 10.0  # a first or last scan further in time from all other scans 
 _MAX_BAD_STAMPS = 0.1  # of all scans; with more, the clock was set back
 
 
-def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream without scans that repeat the points of a recent scan, whatever their stamp, and a note."""
     recent: deque[np.ndarray] = deque(maxlen=_N_RECENT_SCANS)
     fresh = np.ones(len(stream.stamps_ns), bool)
@@ -360,11 +364,12 @@ def without_repeats(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[
     if fresh.all():
         return stream, ()
     lost = stream.stamps_ns[~fresh]
-    note = f"{what}: {len(lost)} scans that repeat an earlier one exactly were dropped, the first at {lost[0]} ns."
+    sentence = f"{what}: {len(lost)} scans that repeat an earlier one exactly were dropped, the first at {lost[0]} ns."
+    note = Remark("scans_repeated", sentence)
     return selected(stream, np.flatnonzero(fresh)), (note,)
 
 
-def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream with strictly increasing stamps, and notes: late scans are sorted, and single scans with a wrong stamp
     are left out.
 
@@ -383,19 +388,23 @@ def in_order(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ..
         )
     notes = ()
     if late:
-        notes += (
+        note = Remark(
+            "scans_out_of_order",
             f"{what}: {len(late)} scans are out of order, the first at {stamps_ns[late[0]]} ns; all were "
             "sorted by stamp.",
         )
+        notes += (note,)
     if bad:
-        notes += (
+        note = Remark(
+            "scan_stamps_wrong",
             f"{what}: {len(bad)} of {len(stamps_ns)} scans have a stamp that does not fit their neighbours' "
             f"and were removed, the first at {stamps_ns[bad[0]]} ns.",
         )
+        notes += (note,)
     return selected(stream, order), notes
 
 
-def with_even_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def with_even_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream with even stamps if a computer stamps scans on arrival that the LiDAR takes evenly, and a note."""
     if (even := even_stamps(stream.stamps_ns, partial(_spans_follow, stream))) is None:
         return stream, ()
@@ -414,7 +423,7 @@ def _spans_follow(stream: LidarStream, number: np.ndarray, delay: np.ndarray) ->
     return share, float(np.sqrt((((longer - share * step) * step) ** 2).sum())) / total
 
 
-def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[str, ...]]:
+def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
     """The stream without scans that are stamped too early or too late between neighbours two periods apart, and a note.
 
     All scans are kept if there are many such scans. A scan is kept if only its begin or its end is off, as part of it
@@ -431,9 +440,10 @@ def at_even_steps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[st
     odd = odd[[_is_off(stream, i, late_ns) for i in odd.tolist()]] if len(odd) else odd
     if not len(odd) or len(odd) > _MAX_BAD_STAMPS * len(stamps_ns):
         return stream, ()
-    note = (
+    note = Remark(
+        "scans_stamped_unevenly",
         f"{what}: {len(odd)} of {len(stamps_ns)} scans are stamped more than {_MAX_STAMP_ERROR:.0%} of a period too "
-        f"early or too late relative to their neighbours and were removed, the first at {stamps_ns[odd[0]]} ns."
+        f"early or too late relative to their neighbours and were removed, the first at {stamps_ns[odd[0]]} ns.",
     )
     return selected(stream, np.setdiff1d(np.arange(len(stamps_ns)), odd)), (note,)
 

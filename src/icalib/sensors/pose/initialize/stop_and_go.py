@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.data.recordings import naming
 from icalib.data.stamps import moved, stands_still_between
@@ -149,20 +150,24 @@ def _with_inliers(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.nd
     return replace(m.with_streams(replace(paired.stream, **columns)), notes=notes)
 
 
-def _notes(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.ndarray, m: Measurements) -> list[str]:
+def _notes(rig: Rig, sensor: PoseSensor, paired: _PairedPoses, bad: np.ndarray, m: Measurements) -> list[Remark]:
     """Notes on the number of pairs, and on the rejected poses `bad` (n,) bool."""
     n = len(paired.stream.stamps_ns)
     words = [
-        f"{n} poses of {sensor.name} were taken at rest, each together with one of the {paired.counts[0]} of "
-        f"{rig.reference}. No motion is assumed in between, and its time_offset is not estimated."
+        Remark(
+            "poses_at_rest",
+            f"{n} poses of {sensor.name} were taken at rest, each together with one of the {paired.counts[0]} of "
+            f"{rig.reference}. No motion is assumed in between, and its time_offset is not estimated.",
+        )
     ]
     if bad.any():
         seconds = paired.stream.stamps_ns[bad][:3] - m.origin_ns
         at = ", ".join(f"{1e-9 * x:.3f} s" for x in seconds)
-        words.append(
+        sentence = (
             f"{sensor.name}: {int(bad.sum())} of its {n} poses do not fit the others and were rejected, {at} after "
             f"the first stamp of {rig.reference}."
         )
+        words.append(Remark("poses_at_rest_rejected", sentence))
     return words
 
 

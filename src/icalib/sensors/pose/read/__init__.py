@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import PoseStream
 from icalib.data.messages import MessageType, TopicInfo, read_poses
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
@@ -130,7 +131,7 @@ _MAX_NET_JUMP_M, _MAX_NET_JUMP_SHARE = 0.05, 0.5
 _MIN_TRAVEL_M, _MIN_TRAVEL_RAD = 0.02, 0.02  # a sensor with smaller largest displacement and rotation is at rest
 
 
-def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[PoseStream, tuple[str, ...]]:
+def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[PoseStream, tuple[Remark, ...]]:
     """The poses with strictly increasing stamps and without single bad poses, and notes on removed or suspicious data.
 
     Raises RecordingError naming `where` and the instant if poses are too few or mostly invalid, or stamps are out of
@@ -159,7 +160,7 @@ def checked_poses(read: PoseReadings, sensor: PoseSensor, where: str) -> tuple[P
     return stream, broken + notes + copied + single + jumped
 
 
-def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[Remark, ...]]:
     """Valid poses, and a note on removed ones. Raises RecordingError if most are invalid."""
     good = are_poses(read.rotation, read.position)
     if good.all():
@@ -170,36 +171,42 @@ def _without_invalid(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple
             f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion, the first at "
             f"{first} ns; correct the program that writes them."
         )
-    return read.some(good), (
+    note = Remark(
+        "poses_invalid",
         f"{what}: {count} of {len(good)} poses are not finite or have no unit quaternion and were removed, the "
         f"first at {first} ns.",
     )
+    return read.some(good), (note,)
 
 
-def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+def _without_copies(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[Remark, ...]]:
     """Poses without stale copies, and a note if any was removed."""
     stale = stale_copies(read.seconds, read.rotation, read.position)
     if not stale.any():
         return read, ()
-    return read.some(~stale), (
+    note = Remark(
+        "poses_stale",
         f"{what}: {int(stale.sum())} of {len(stale)} poses repeat an earlier one exactly during motion, as if "
         "the tracker was lost or the driver sent its last pose again. They were removed, the first at "
         f"{read.stamps_ns[np.argmax(stale)]} ns.",
     )
+    return read.some(~stale), (note,)
 
 
-def _without_outliers(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+def _without_outliers(read: PoseReadings, what: str) -> tuple[PoseReadings, tuple[Remark, ...]]:
     """Poses without single outliers, and a note if any was removed."""
     wrong = single_outliers(read.seconds, read.rotation, read.position)
     if not wrong.any():
         return read, ()
-    return read.some(~wrong), (
+    note = Remark(
+        "pose_outliers",
         f"{what}: {int(wrong.sum())} of {len(wrong)} poses are outliers of the trajectory and were removed, "
         f"the first at {read.stamps_ns[np.argmax(wrong)]} ns.",
     )
+    return read.some(~wrong), (note,)
 
 
-def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[str, ...]]:
+def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[PoseReadings, tuple[Remark, ...]]:
     """Poses on the trajectory, and a note on jumps. Raises RecordingError if jumps of absolute poses do not cancel."""
     path = continuous_poses(read.seconds, read.rotation, read.position)
     if not len(path.jumps):
@@ -213,11 +220,13 @@ def _on_trajectory(read: PoseReadings, sensor: PoseSensor, what: str) -> tuple[P
             f"relative for {sensor.name} in the rig file, with an IMU, or cut the recording with --from and --to."
         )
     if not count:
-        return read, (f"{words}; the robust loss reduces their weight.",)
-    return read.some(path.on), (
+        return read, (Remark("poses_jump", f"{words}; the robust loss reduces their weight."),)
+    note = Remark(
+        "poses_off_trajectory",
         f"{words}. {count} of {len(path.on)} poses are off the trajectory of the others, as if the tracker was "
         f"lost, and were removed; the longest gap is {path.longest_s:.2g} s.",
     )
+    return read.some(path.on), (note,)
 
 
 def _refuse_stillness(read: PoseReadings, what: str) -> None:

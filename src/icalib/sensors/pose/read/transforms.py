@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from icalib.base.remark import Remark
 from icalib.data.images import Note, ignore
 from icalib.data.messages import HasMessages, TopicInfo, find_topic, unit_rotations
 from icalib.data.tables import STAMP, Table, TableKind, holds, in_axes, read_table, split_kind, vector_names
@@ -127,10 +128,11 @@ def read_edges(bag: HasMessages, topics: Sequence[TopicInfo], note: Note) -> dic
         static, where = topic.name.endswith(_STATIC), f"{bag.root} {topic.name}"
         received = _rows(bag, topic.name)
         if not static and (unstamped := sum(r.unstamped for r in received.values())):
-            note(
+            sentence = (
                 f"{where}: {unstamped} transforms have no stamp. Their receive times are used instead, which "
                 "are late and jittery; let the publisher stamp them."
             )
+            note(Remark("transforms_without_stamp", sentence))
         for pair, r in received.items():
             rows = np.array(r.values, np.float64).reshape(-1, 7)
             edges[pair] = _edge(pair, np.array(r.stamps_ns, np.int64), rows, static, where, note)
@@ -175,10 +177,11 @@ def _edge(pair: Pair, stamps_ns: np.ndarray, rows: np.ndarray, static: bool, whe
             "quaternion, as are most others; correct the publisher."
         )
     if not good.all():
-        note(
+        sentence = (
             f"{where}: {int((~good).sum())} of {len(good)} transforms {frames} are not finite or have no unit "
             f"quaternion and were removed, the first at {stamps_ns[np.argmin(good)]} ns."
         )
+        note(Remark("transforms_invalid", sentence))
     stamps_ns, rows = stamps_ns[good], rows[good]
     if static:  # the last message replaces earlier ones
         stamps_ns, rows = stamps_ns[-1:], rows[-1:]
@@ -258,11 +261,12 @@ def _common_stamps(moving: Sequence[Edge], what: str, frames: str, note: Note) -
             f"{what}: the transforms between {frames} have no time in common; check the clocks of their publishers."
         )
     if not known.all():
-        note(
+        sentence = (
             f"{what}: {int((~known).sum())} of {len(known)} poses {frames} were removed, the first at "
             f"{stamps_ns[np.argmin(known)]} ns, because another transform between the two frames is missing "
             "there."
         )
+        note(Remark("transforms_missing", sentence))
     return stamps_ns[known]
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.ndimage import median_filter
 
+from icalib.base.remark import Remark
 from icalib.data.images import Note, ignore
 from icalib.data.messages import TopicInfo
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
@@ -53,7 +54,7 @@ RECEIVER_KINDS = (RECEIVER, SENTENCE)
 POSITION_KINDS = ((NAVSAT, POINT), *((kind,) for kind in RECEIVER_KINDS), ("pose", "odometry"))
 METRIC_KINDS = (POINT, *POSITION_KINDS[-1])
 MESSAGES = tuple(message for message, _ in FIX_TYPES.values())
-Noted = tuple[PositionReadings, tuple[str, ...]]
+Noted = tuple[PositionReadings, tuple[Remark, ...]]
 
 
 def _stamps(path: Path, layout: TableLayout) -> np.ndarray:
@@ -81,7 +82,9 @@ def read(recording: Recording, sensors: Sequence[PositionSensor], reading: Readi
             frame = AS_RECORDED if owner is None else owner[0].frame
             if readings.frame is not frame:
                 readings = readings.inside(what, frame, sensor.shared_frame)
-                notes += (f"{what}: its positions were then converted to the frame of {sensor.shared_frame}.",)
+                sentence = f"{what}: its positions were then converted to the frame of {sensor.shared_frame}."
+                note = Remark("positions_converted", sentence)
+                notes += (note,)
         stream, more = checked_positions(reading.cut(readings, what), what)
         streams.append((stream, notes + more))
     return streams
@@ -122,11 +125,14 @@ def _of_file(sensor: PositionSensor, path: Path, note: Note) -> tuple[PositionRe
 def _of_topic(recording: Recording, sensor: PositionSensor, topic: TopicInfo, what: str) -> Noted:
     message, fix_of = FIX_TYPES[topic.type]
     fixes = [(stamp_ns, fix) for stamp_ns, fix in recording.messages(topic.name, topic.kind, fix_of) if fix is not None]
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     if not message.stamped:
         timed = [(fix.utc_ns, fix) for _, fix in fixes if fix.utc_ns is not None]
         unknown = f"; {len(fixes) - len(timed)} fixes without it were left out" if len(timed) < len(fixes) else ""
-        fixes, notes = timed, (f"{what}: its stamps are the receiver's time (UTC){unknown}.",)
+        fixes, notes = (
+            timed,
+            (Remark("stamps_of_receiver", f"{what}: its stamps are the receiver's time (UTC){unknown}."),),
+        )
     order = recording.by_stamp(topic.name, np.array([stamp_ns for stamp_ns, _ in fixes], np.int64))
     written = from_fixes(sensor.name, [fixes[k] for k in order.tolist()])
     readings, more = _in_metres(written, "local" if topic.kind in METRIC_KINDS else "geodetic", sensor, what)
@@ -161,7 +167,7 @@ _MIN_FROZEN_FIXES = 4  # equal fixes in a row: receivers round, and some stand s
 _MAX_ACCELERATION_M_S2, _MIN_LEAP_M = 5.0, 0.3
 
 
-def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream, tuple[str, ...]]:
+def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream, tuple[Remark, ...]]:
     """The fixes with strictly increasing stamps, without outliers and repeated fixes, and notes on those removed.
 
     Raises RecordingError naming `what` and the instant where fixes are too few, not finite, not in order, without
@@ -172,14 +178,16 @@ def checked_positions(read: PositionReadings, what: str) -> tuple[PositionStream
             f"{what}: only {len(read.stamps_ns)} fixes are usable; a calibration needs the whole recording."
         )
     finite = np.asarray(np.isfinite(read.position).all(axis=1))
-    notes: tuple[str, ...] = ()
+    notes: tuple[Remark, ...] = ()
     if not finite.all():
         if finite.sum() < MIN_FIXES or finite.mean() < 0.5:
             raise RecordingError(
                 f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite, the first at "
                 f"{read.stamps_ns[np.argmin(finite)]} ns; correct the program that writes them."
             )
-        notes += (f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite and were removed.",)
+        sentence = f"{what}: {int((~finite).sum())} of {len(finite)} positions are not finite and were removed."
+        note = Remark("positions_not_finite", sentence)
+        notes += (note,)
         read = read.some(finite)
     remedy = "write the receiver's own stamps"
     kept, repeated = kept_readings(read.stamps_ns, read.position, what, FIX_RATES_HZ, "fix", remedy)
@@ -214,7 +222,7 @@ def _refuse_units(read: PositionReadings, what: str) -> None:
         )
 
 
-def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
+def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[Remark, ...]]:
     """The fixes without runs that a frozen receiver repeats, and a note. Before or after such a run the acceleration is
     beyond that of a vehicle. The first fix of a run stays."""
     t, p = read.seconds, read.position
@@ -226,9 +234,10 @@ def _without_frozen(read: PositionReadings, what: str) -> tuple[PositionReadings
     if not frozen.any():
         return read, ()
     seconds = float(np.diff(t, prepend=t[0])[frozen].sum())
-    note = (
+    note = Remark(
+        "receiver_frozen",
         f"{what}: {int(frozen.sum())} fixes repeat the one before exactly while the antenna moves, as if the receiver "
-        f"was frozen, {seconds:.1f} s in all, the first at {read.stamps_ns[np.argmax(frozen)]} ns; they were removed."
+        f"was frozen, {seconds:.1f} s in all, the first at {read.stamps_ns[np.argmax(frozen)]} ns; they were removed.",
     )
     return read.some(~frozen), (note,)
 
@@ -249,17 +258,19 @@ def _leaps(t: np.ndarray, p: np.ndarray, k: int) -> bool:
     return distance > max(_MIN_LEAP_M, 0.5 * _MAX_ACCELERATION_M_S2 * step**2)
 
 
-def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[str, ...]]:
+def _without_singles(read: PositionReadings, what: str) -> tuple[PositionReadings, tuple[Remark, ...]]:
     wrong = single_wrong(read.seconds, read.position)
     if not wrong.any():
         return read, ()
-    return read.some(~wrong), (
-        f"{what}: {int(wrong.sum())} of {len(wrong)} fixes are outliers of the trajectory and were removed, the first "
-        f"at {read.stamps_ns[np.argmax(wrong)]} ns.",
+    note = Remark(
+        "fix_outliers",
+        f"{what}: {int(wrong.sum())} of {len(wrong)} fixes are outliers of the trajectory and were removed, the "
+        f"first at {read.stamps_ns[np.argmax(wrong)]} ns.",
     )
+    return read.some(~wrong), (note,)
 
 
-def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
+def _jumps(read: PositionReadings, what: str) -> tuple[Remark, ...]:
     """A note on steps of the solution."""
     first, vectors = steps(read.seconds, read.position)
     if not len(first):
@@ -267,9 +278,12 @@ def _jumps(read: PositionReadings, what: str) -> tuple[str, ...]:
     size = np.linalg.norm(vectors, axis=1)
     times = "once" if len(first) == 1 else f"{len(first)} times"
     return (
-        f"{what}: its fixes jump {times}, by up to {size.max():.2g} m, the first at {read.stamps_ns[first[0]]} ns, as "
-        "when a receiver gains or loses its carrier-phase solution. Fixes that do not fit the trajectory are rejected; "
-        "leave worse fixes out with least_status, or cut the recording with --from and --to.",
+        Remark(
+            "fixes_jump",
+            f"{what}: its fixes jump {times}, by up to {size.max():.2g} m, the first at {read.stamps_ns[first[0]]} ns, "
+            "as when a receiver gains or loses its carrier-phase solution. Fixes that do not fit the trajectory are "
+            "rejected; leave worse fixes out with least_status, or cut the recording with --from and --to.",
+        ),
     )
 
 

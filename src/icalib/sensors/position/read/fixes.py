@@ -13,7 +13,9 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from icalib.base.remark import Remark
 from icalib.data.images import Note, ignore
+from icalib.data.measurements import far_origin_note
 from icalib.data.messages import MessageType, pose_of
 from icalib.data.tables import STAMP, TableKind, named, places_by_name, read_bytes, read_table
 from icalib.errors import RecordingError
@@ -109,7 +111,7 @@ def is_nmea(path: Path) -> bool:
     return path.name.removesuffix(".gz").endswith((".nmea", ".txt")) and b"GGA," in read_bytes(path)
 
 
-def read_nmea(path: Path, note: Callable[[str], None]) -> list[tuple[int, RecordedFix]]:
+def read_nmea(path: Path, note: Note) -> list[tuple[int, RecordedFix]]:
     """Stamp [ns] and fix of each GGA sentence of a log, which may be gzipped. Stamps count from 1970 if an RMC sentence
     has the date, else from midnight. note: called with a sentence on damaged lines. Raises RecordingError without
     fixes."""
@@ -131,7 +133,7 @@ def read_nmea(path: Path, note: Callable[[str], None]) -> list[tuple[int, Record
     if not fixes:
         raise RecordingError(f"{path} holds no GGA sentence with a fix; log GGA, or write a table of positions.")
     if damaged:
-        note(f"{path}: {damaged} damaged sentences were left out.")
+        note(Remark("nmea_sentences_damaged", f"{path}: {damaged} damaged sentences were left out."))
     return fixes
 
 
@@ -332,16 +334,22 @@ def good_fixes(status: np.ndarray, least: Status, n: int) -> np.ndarray:
     return status >= STATUSES.index(least) if len(status) else np.ones(n, dtype=bool)
 
 
-def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> tuple[str, ...]:
+def left_out(what: str, status: np.ndarray, good: np.ndarray, least: Status) -> tuple[Remark, ...]:
     """A note on fixes that are not good."""
     if good.all():
         return ()
     none, worse = int((status < 0).sum()), int((~good & (status >= 0)).sum())
     parts = [f"{none} without a fix"] * (none > 0) + [f"{worse} worse than {least} (least_status)"] * (worse > 0)
-    return (f"{what}: {none + worse} of {len(good)} positions were left out, {' and '.join(parts)}.",)
+    return (
+        Remark(
+            "fixes_left_out", f"{what}: {none + worse} of {len(good)} positions were left out, {' and '.join(parts)}."
+        ),
+    )
 
 
-def from_geodetic(what: str, readings: PositionReadings, good: np.ndarray) -> tuple[PositionReadings, tuple[str, ...]]:
+def from_geodetic(
+    what: str, readings: PositionReadings, good: np.ndarray
+) -> tuple[PositionReadings, tuple[Remark, ...]]:
     """Those of `readings` that are `good` (N,) bool, in metres east, north and up of the first, and a note. Covariances
     are in these axes already, positions latitude and longitude [deg] and height over the WGS84 ellipsoid [m].
 
@@ -369,9 +377,10 @@ def from_geodetic(what: str, readings: PositionReadings, good: np.ndarray) -> tu
             f"{what}: its fixes are up to {away / 1e3:.0f} km from the first one; the plane of east and north does not "
             "follow the Earth so far. Cut the recording with --from and --to, or leave out fixes without a solution."
         )
-    note = (
+    note = Remark(
+        "positions_from_geodetic",
         f"{what}: metres are east, north and up of the first fix, latitude {latitude[first]:.8f}, longitude "
-        f"{longitude[first]:.8f}, height {height[first]:.3f} m."
+        f"{longitude[first]:.8f}, height {height[first]:.3f} m.",
     )
     return replace(readings, position=position, frame=LocalFrame(xyz[first], axes, True)).some(usable), (note,)
 
@@ -386,7 +395,7 @@ def _refuse_heights(what: str, degrees: np.ndarray, good: np.ndarray) -> None:
         )
 
 
-def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[str, ...]]:
+def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings, tuple[Remark, ...]]:
     """Readings in metres, and a note. If the first position is more than 100 m from the origin of the frame, the origin
     moves to the first position, rounded to whole metres. Raises RecordingError if no position is finite."""
     p = readings.position
@@ -396,9 +405,8 @@ def about_first(what: str, readings: PositionReadings) -> tuple[PositionReadings
     origin = np.round(p[int(np.argmax(finite))])
     if np.linalg.norm(origin) <= 100.0:
         return readings, ()
-    x, y, z = origin
-    note = f"{what}: positions are relative to ({x:.0f}, {y:.0f}, {z:.0f}) m of its frame, whose origin is far away."
-    return replace(readings, position=p - origin, frame=readings.frame.moved(origin)), (note,)
+    moved = replace(readings, position=p - origin, frame=readings.frame.moved(origin))
+    return moved, (far_origin_note(what, origin),)
 
 
 def from_fixes(name: str, stamped: Sequence[tuple[int, RecordedFix]]) -> PositionReadings:
