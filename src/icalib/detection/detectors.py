@@ -24,7 +24,7 @@ from icalib.detection.tag_boards import (
     dark_squares,
     grid_tags,
 )
-from icalib.detection.tags import ImageWithQuads, find_tags, tag_family, tags_at
+from icalib.detection.tags import ImageWithQuads, find_tags, tag_family
 from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, Scene, Target
 from icalib.geometry.targets.families import FAMILIES, TagSet, is_available
@@ -247,9 +247,8 @@ def with_other_border(views: Iterable[ImageWithQuads], tags: TagSet, others: Ite
     ids = sorted(set(tags.ids) - {i for other in others for i in swapped.shared_with(other)})
     ids_by_border: dict[int, list[np.ndarray]] = {1: [], 2: []}
     for view in islice(views, _DIAGNOSED_IMAGES):
-        quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for border, decoded_ids in ids_by_border.items():
-            read = tags_at(view.image, quads, tag_family(tags.family), border).ids
+            read = view.ids(tags.family, border)
             decoded_ids.append(read[np.isin(read, ids)])
     stated, swap = (np.concatenate([np.zeros(0, np.int64), *ids_by_border[t.border_bits]]) for t in (tags, swapped))
     if len(swap) < _MANY_MORE * max(len(stated), 1):
@@ -283,10 +282,8 @@ def _candidates(images: list[np.ndarray]) -> list[_VisibleTags]:
     tried = [name for name in _TRIED if is_available(name)]
     for image, how in product(images, _HOWS):
         view = ImageWithQuads({"": image, "mirrored": image[:, ::-1], "inverted": 255 - image}[how])
-        quads = np.concatenate([view.quads(window, apart) for window in view.windows for apart in (True, False)])
         for name, border in product(tried, _BORDERS):
-            ids = tags_at(view.image, quads, tag_family(name), border).ids
-            ids_by_kind.setdefault((name, border, how), []).append(ids)
+            ids_by_kind.setdefault((name, border, how), []).append(view.ids(name, border))
     tags = [_VisibleTags(*key, np.concatenate(ids)) for key, ids in ids_by_kind.items()]
     least = {name: _LEAST_TAGS.get(tag_family(name).bits, _LEAST_TAGS_USUALLY) for name in tried}
     return [one for one in tags if len(one.ids) >= least[one.family]]

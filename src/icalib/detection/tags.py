@@ -138,6 +138,7 @@ class ImageWithQuads:
 
     image: np.ndarray
     _quads: dict[tuple[int, bool], np.ndarray] = field(default_factory=dict)
+    _ids: dict[tuple[str, int], np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "image", checked_image(self.image))
@@ -152,6 +153,13 @@ class ImageWithQuads:
         if (window, separate) not in self._quads:
             self._quads[window, separate] = dark_quads(self.image, window, separate)
         return self._quads[window, separate]
+
+    def ids(self, family: str, border_bits: int) -> np.ndarray:
+        """(n,) ids of all tags of `family` at the quads of every window, from the cache if known."""
+        if (family, border_bits) not in self._ids:
+            quads = np.concatenate([self.quads(window, apart) for window in self.windows for apart in (True, False)])
+            self._ids[family, border_bits] = tags_at(self.image, quads, tag_family(family), border_bits).ids
+        return self._ids[family, border_bits]
 
 
 def dark_quads(image: np.ndarray, window: int, separate: bool) -> np.ndarray:
