@@ -43,7 +43,9 @@ def nanoseconds(seconds: np.ndarray) -> np.ndarray:
     return np.round(seconds * 1e9).astype(np.int64)
 
 
-@pytest.fixture(scope="module", params=FIRST_ROW)
+@pytest.fixture(
+    scope="module", params=["hkumars", *(pytest.param(n, marks=pytest.mark.full) for n in FIRST_ROW if n != "hkumars")]
+)
 def logs(request, odometry_logs: Path) -> tuple[str, Measurements, Published]:
     folder = odometry_logs / request.param
     imu, lidar, poses, filtered = (

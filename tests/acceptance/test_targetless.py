@@ -41,6 +41,7 @@ def recorded(tmp_path_factory):
     return rig.with_(cameras=(camera,), settings=Settings()), path, filmed.truth
 
 
+@pytest.mark.full
 def test_a_camera_is_calibrated_from_raw_images_of_a_room(recorded, tmp_path, monkeypatch):
     monkeypatch.setenv("ICALIB_CACHE", str(tmp_path))
     rig, path, truth = recorded

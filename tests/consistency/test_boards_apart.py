@@ -62,7 +62,7 @@ def error(result: Calibration) -> np.ndarray:
     return np.concatenate([turn, T[:3, 3] - BACK[:3, 3]])
 
 
-@pytest.mark.parametrize("front", [1, 2])
+@pytest.mark.parametrize("front", [2, pytest.param(1, marks=pytest.mark.full)])
 def test_noiseless_images_give_the_truth(front: int):
     simulation = simulate(boards_apart(noiseless=True, front=front), 1)
     boards = [np.unique(simulation.scenario.target.body[c.point]).tolist() for c in simulation.measurements.cameras]
@@ -86,6 +86,7 @@ def test_the_covariance_is_honest():
     assert low < sum(squares) < high
 
 
+@pytest.mark.full
 def test_two_recordings_tell_what_each_of_them_tells():
     one, two = (simulate(boards_apart(), seed) for seed in (1, 2))
     together, alone = calibrated(one, two), calibrated(one)

@@ -120,6 +120,7 @@ def as_noise_makes_it(found: CrossValidation) -> bool:
     return abs(found.excess - found.expected) < 4.0 * found.spread
 
 
+@pytest.mark.full
 def test_of_two_recordings_each_finds_how_its_board_leans():
     """A part each: each half has a tilt of its own, of which the other knows nothing."""
     simulations = pair(1)

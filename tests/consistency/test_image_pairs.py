@@ -21,7 +21,7 @@ def some_images(stream: CornerStream, kept: np.ndarray) -> CornerStream:
     return CornerStream(stream.name, stamps, start, stream.point[every], stream.uv[every], files=files)
 
 
-@pytest.mark.parametrize("late", [(), (7, 19, 20)])
+@pytest.mark.parametrize("late", [(7, 19, 20), pytest.param((), marks=pytest.mark.full)])
 def test_pairs_that_were_not_exposed_together_are_left_out_and_told(late: tuple[int, ...]):
     simulation = simulate(handheld(20.0), 6)
     first, second = simulation.measurements.cameras

@@ -44,6 +44,7 @@ def test_effects_of_two_sigma_are_within_four_printed_ones(program: ModuleType, 
     assert (row.converged, row.failures, row.far) == (1, (), False), row
 
 
+@pytest.mark.full
 def test_taken_for_ideal_such_an_imu_is_far_off(program: ModuleType):
     """Or the test above could not fail."""
     kind = program.KINDS["camera + IMU"]

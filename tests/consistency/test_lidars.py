@@ -159,7 +159,7 @@ def turning_alone_shows(shown: str, not_shown: str):
 NEAR = [off_below("lidar0.translation", 3e-3), off_below("lidar0.rotation", np.deg2rad(0.03))]
 
 CASES: dict[str, Case] = {
-    "free motion": Case(lambda: simulate(make_robot("3d", 10.0, "l"), 0), [known(7)]),
+    "free motion": Case(lambda: simulate(make_robot("3d", 10.0, "l"), 0), [known(7)], full=True),
     "planes are found in the clouds": Case(
         lambda: simulate(make_robot("3d", 10.0, "l", 300), 0), [known(7), *NEAR], seen=planes_found
     ),
@@ -194,6 +194,7 @@ CASES: dict[str, Case] = {
         lambda: simulate(make_robot("planar", 12.0, "lw"), 0),
         [known(), wheels_are_as_high_as_the_tape_says],
         with_a_tape,
+        full=True,
     ),
     # Beside cameras of which nothing is known; from tracks alone they are refused in the plane.
     "a flat floor, with a camera before a target, from nothing": Case(
@@ -212,6 +213,7 @@ CASES: dict[str, Case] = {
         ),
         [known(), only_heights_are_open],
         from_nothing,
+        full=True,
     ),
     "a flat floor, with cameras that follow points": Case(
         lambda: simulate(following_points("planar"), 4000),
@@ -238,6 +240,7 @@ CASES: dict[str, Case] = {
         lambda: simulate(reporting(straight("lw", 10.0, 150), "twist"), 0),
         [known(), turning_alone_shows("wheel0.scales.speed", "wheel0.scales.yaw_rate")],
         true_guess,
+        full=True,
     ),
     "a straight line with steered wheels": Case(
         lambda: simulate(reporting(straight("lw", 20.0, 150), "steering"), 0),

@@ -70,7 +70,7 @@ def test_without_noise_it_is_recovered(kind):
     assert result.unobservable == ()
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative"])
+@pytest.mark.parametrize("kind", ["absolute", pytest.param("relative", marks=pytest.mark.full)])
 def test_beside_a_camera_it_is_recovered(kind):
     """The target gives the motion, the world is the target's; frames still are anywhere. Poses are taken at stamps of
     the IMU: between these the simulated rates are constant, and the scheme takes them to be linear."""
@@ -149,6 +149,7 @@ def test_two_of_them_and_one_gives_the_motion():
             assert (np.abs(e) < 4.0 * result.group(name, block).std).all(), (name, block)
 
 
+@pytest.mark.full
 def test_two_recordings_share_what_is_calibrated():
     """Each has a world and a frame of its own; the frame was put up anew in between."""
     scenario = replace(handheld(6.0), sensors=(sensor("absolute", clock_origin_ns=10**18, rate_hz=50.0),))
@@ -163,7 +164,7 @@ def test_two_recordings_share_what_is_calibrated():
         assert (np.abs(e) < 4.0 * std).all() and (std < one.group("mocap0", block).std).all(), block
 
 
-@pytest.mark.parametrize("kind", ["absolute", "relative"])
+@pytest.mark.parametrize("kind", ["absolute", pytest.param("relative", marks=pytest.mark.full)])
 def test_two_recordings_without_any_other_sensor(kind):
     """The shorter one first; its frame stands elsewhere, and its clocks began at another time."""
     scenario = alone(kind)

@@ -87,6 +87,7 @@ def test_each_recording_has_its_own(robot, example, parts, azimuth_steps):
     check_offsets(result, simulations)
 
 
+@pytest.mark.full
 def test_a_clock_that_ran_on_is_no_worse(robot):
     """Two offsets of one clock agree, and all else is what one offset gives, if not quite as well known."""
     scenario = robot("3d", 14.0, "c")

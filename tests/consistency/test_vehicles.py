@@ -168,6 +168,7 @@ CASES: dict[str, Case] = {
         lambda: simulate(reporting(make_robot("ramp", 30.0, "cw"), "twist"), 0),
         [known(), have("determined", "wheel0.scales")],
         without_slip,
+        full=True,
     ),
     "steered front wheels": Case(
         lambda: simulate(reporting(make_robot("ramp", 30.0, "cw"), "steering"), 0),
@@ -186,6 +187,7 @@ CASES: dict[str, Case] = {
         lambda: simulate(make_robot("planar", 20.0, "cw"), 0),
         [is_upright, known(), leaves_open("cam0.translation.z", "wheel0.translation.z")],
         on_level_ground,
+        full=True,
     ),
     "hills where a flat floor is stated": Case(
         lambda: simulate(make_robot("ramp", 20.0, "cw"), 0),
@@ -222,6 +224,7 @@ CASES: dict[str, Case] = {
         [known(), leaves_open("wheel0.rotation.x", "wheel0.translation.z")],
         alone,
         no_imu,
+        full=True,
     ),
     "a camera with a target and wheels": Case(
         lambda: ideal_imu(make_robot("ramp", 20.0, "cw")),
@@ -231,7 +234,11 @@ CASES: dict[str, Case] = {
     ),
     # Nothing is made up of the 14 s between.
     "a target that is out of sight for long": Case(
-        lambda: ideal_imu(make_robot("ramp", 20.0, "cw"), 3), [target_was_out_of_sight, known(10)], alone, no_imu
+        lambda: ideal_imu(make_robot("ramp", 20.0, "cw"), 3),
+        [target_was_out_of_sight, known(10)],
+        alone,
+        no_imu,
+        full=True,
     ),
     "hand-eye calibration": Case(
         lambda: ideal_imu(two_mocaps(time_offset_s=-0.02, rate_hz=30.0)),
@@ -241,7 +248,7 @@ CASES: dict[str, Case] = {
     ),
     # As a target that is seen from far.
     "the body's poses are half a degree and a centimetre off": Case(
-        lambda: ideal_imu(two_mocaps(**POOR)), [known(7), body_is("slam0")], alone, no_imu
+        lambda: ideal_imu(two_mocaps(**POOR)), [known(7), body_is("slam0")], alone, no_imu, full=True
     ),
     "tracked points and motion capture from nothing": Case(
         following_beside_mocap, [known(7 + 8), body_is("mocap0")], alone_with_free_lens, no_imu
