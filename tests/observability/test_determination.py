@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from icalib.estimate.jacobian_noise import Spurious
-from icalib.observability.determination import _are_alike, _principal_directions, scatter
+from icalib.observability.determination import _are_alike, _principal_directions, error_covariance
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
@@ -51,7 +51,7 @@ def test_noise_adds_more_than_is_allowed_for_once_in_a_thousand(n: int):
 def test_noise_never_makes_a_variance_smaller():
     """Draws may say by chance that it takes something off, even more than there is."""
     known, noise = np.diag([2.0, -0.3, 5.0]), np.diag([-0.5, -3.0, 1.0])
-    said = np.diag(scatter(known, noise, np.zeros((3, 0))))
+    said = np.diag(error_covariance(known, noise, np.zeros((3, 0))))
     np.testing.assert_allclose(said[[0, 2]], [1.0 / 2.0, 1.0 / 5.0 + 1.0 / 25.0])
     assert said[1] > 1e3
 
@@ -61,7 +61,7 @@ def test_what_is_odd_in_noise_hardly_moves_a_variance():
     known = np.array([[1e6, -1e6 + 1.0], [-1e6 + 1.0, 1e6]])
     root = np.linalg.cholesky(np.linalg.inv(known))
     odd = np.linalg.inv(root).T @ (0.01 * np.array([[0.0, 1.0], [1.0, 0.0]])) @ np.linalg.inv(root)
-    said, without = np.diag(scatter(known, odd, NOTHING)), np.diag(np.linalg.inv(known))
+    said, without = np.diag(error_covariance(known, odd, NOTHING)), np.diag(np.linalg.inv(known))
     assert (said >= without).all() and (said < 1.0101 * without).all()
 
 
@@ -91,6 +91,6 @@ def test_the_covariance_is_that_of_a_regression_with_noisy_regressors():
     for _ in range(2500):
         seen = X + sigma * rng.standard_normal((n, 2))
         found.append(np.linalg.solve(seen.T @ seen - noise, seen.T @ rng.standard_normal(n)))
-    said, formal = scatter(known, noise, NOTHING), np.linalg.inv(known + noise)
+    said, formal = error_covariance(known, noise, NOTHING), np.linalg.inv(known + noise)
     np.testing.assert_allclose(np.cov(np.array(found).T), said, rtol=0.12)
     assert (np.diag(said) > 2.0 * np.diag(formal)).all()

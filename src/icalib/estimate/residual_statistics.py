@@ -28,7 +28,7 @@ from icalib.optim.arrowhead import (
 )
 from icalib.optim.state import State
 
-# Degrees of freedom after the fit, and covariances from the scatter of segments.
+# Degrees of freedom after the fit.
 
 DRAW_STEP = 1e-3  # of a posterior draw: step of difference quotients, small enough to be linear
 
@@ -71,103 +71,6 @@ def _spent(problem: Problem, outcome: Outcome, draw: Draw) -> dict[FitKey, float
     start, end = (outcome.state.retract(problem.layout, s * draw.chain, s * draw.calib) for s in (0.0, DRAW_STEP))
     along, at = StateDifference(start, end, DRAW_STEP), outcome.residuals
     return {kind: dof for key, f in problem.factors.items() for kind, dof in f.dof_used(at[key], along).items()}
-
-
-def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:
-    """(B, B) covariance of the calibration parameters from the scatter of segments.
-
-    The gradient b_g of segment g at the joint optimum, the joint trajectory marginalised, would be zero but for noise.
-    With the joint information S, the scatter gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
-    jackknife to first order.
-    """
-    b, n = parts.gradients, parts.count
-    return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
-
-
-def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
-    """(B,) expected variances of `split_covariance` for white noise.
-
-    At the joint optimum the gradient of segment g has the covariance S_g - S_g S^-1 S_g, because a segment with much
-    information pulls the optimum towards itself (leverage; Bell and McCaffrey 2002). S_g is the information of the
-    segment alone, and an equal share of what only the joint trajectory adds. For equal segments these are the formal
-    variances.
-    """
-    t, n = parts.problem.tolerance, parts.count
-    inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
-    segment_information = parts.sums[:, :-1, :-1]
-    known = (segment_information + (parts.information - segment_information.sum(axis=0)) / n) * t[:, None] * t
-    left = (known - known @ inverse @ known).sum(axis=0)
-    return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
-
-
-def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
-    """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B) and the information S of `outcome`; zero along fixed
-    directions."""
-    t = problem.tolerance
-    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.fixed_directions)
-    half = t[:, None] * (inverse @ (t[:, None] * b.T))
-    return half @ half.T
-
-
-# Cluster-robust covariances, for errors that correlate within clusters such as a region of the image or of the target.
-#
-# A lens that its model does not fit, or a target that is not as drawn, makes the same errors in all segments of a
-# recording. The scatter over segments does not show them. The gradient of a cluster would be zero but for noise.
-# Measurements in no cluster, such as those of the IMU, form one more cluster, unless the clusters are a sample (Liang
-# and Zeger 1986).
-
-
-@dataclass(frozen=True)
-class ClusterCovariances:
-    """Cluster-robust covariances (B, B). regions: one for each way to divide images or target into regions, such as
-    image cells. tracks: for groups of feature tracks, None without tracks."""
-
-    regions: list[np.ndarray]
-    tracks: np.ndarray | None
-
-
-def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
-    """Cluster-robust (sandwich) covariances of the calibration parameters."""
-    every = [c for model in models().values() for c in model.clusters(problem.factors)]
-    gradients = _cluster_gradients(problem, outcome, [c.of_factor for c in every]) if every else []
-    regions, tracks = [], None
-    for clusters, b in zip(every, gradients, strict=True):
-        if clusters.is_sample:
-            centred = b - b.mean(axis=0)
-            tracks = len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, centred)
-        else:
-            regions.append(spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])))
-    return ClusterCovariances(regions, tracks)
-
-
-def _count(clusters: Mapping[FactorKey, Any]) -> int:
-    """Number of clusters."""
-    arrays = [a for labels in clusters.values() for a in (labels if isinstance(labels, list) else [labels])]
-    return 1 + max(int(a.max(initial=-1)) for a in arrays)
-
-
-def _cluster_gradients(
-    problem: Problem, outcome: Outcome, kinds: Sequence[Mapping[FactorKey, Any]]
-) -> list[np.ndarray]:
-    """Gradient of each cluster, (clusters, B) for each of `kinds`; chain and points are marginalised.
-
-    Each cluster gets a column beside the calibration parameters, with its gradient as the right-hand side. Eliminating
-    the chain and the points then marginalises all gradients at once.
-    """
-    counts = [_count(kind) for kind in kinds]
-    B, state, at = problem.layout.size, outcome.state, problem.reusable_output(outcome.residuals)
-    starts = B + np.cumsum([0, *counts])
-
-    def segment(first: int, last: int) -> Piece:
-        piece = problem.piece_with_columns(state, first, last, sum(counts), at)
-        for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):
-            for key, cluster in kind.items():
-                factor: Any = problem.factors[key]  # it has `accumulate_clusters`
-                factor.accumulate_clusters(state, piece, at[key], cluster, n, column)
-        return piece
-
-    rest = problem.marginal(segment)
-    return [rest[:B, a:b].T for a, b in pairwise(starts)]
 
 
 # Independent segments of a recording: information and gradient of each on the calibration parameters, its keyframes
@@ -311,6 +214,106 @@ def segment_ends(starts: tuple[int, ...], n_keyframes: int, segments: int) -> np
     counts = np.maximum(np.round(segments * np.diff(edges) / edges[-1]).astype(int), 1)
     pieces = [np.linspace(a, b, n + 1)[:-1] for a, b, n in zip(edges[:-1], edges[1:], counts, strict=True)]
     return np.concatenate([*pieces, edges[-1:]]).astype(int)
+
+
+# Covariances from the scatter of segments.
+
+
+def split_covariance(outcome: Outcome, parts: Segments) -> np.ndarray:
+    """(B, B) covariance of the calibration parameters from the scatter of segments.
+
+    The gradient b_g of segment g at the joint optimum, the joint trajectory marginalised, would be zero but for noise.
+    With the joint information S, the scatter gives S^-1 (G / (G - 1) sum (b_g - b)(b_g - b)^T) S^-1, the block
+    jackknife to first order.
+    """
+    b, n = parts.gradients, parts.count
+    return n / (n - 1.0) * spread_covariance(parts.problem, outcome, b - b.mean(axis=0))
+
+
+def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
+    """(B,) expected variances of `split_covariance` for white noise.
+
+    At the joint optimum the gradient of segment g has the covariance S_g - S_g S^-1 S_g, because a segment with much
+    information pulls the optimum towards itself (leverage; Bell and McCaffrey 2002). S_g is the information of the
+    segment alone, and an equal share of what only the joint trajectory adds. For equal segments these are the formal
+    variances.
+    """
+    t, n = parts.problem.tolerance, parts.count
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
+    segment_information = parts.sums[:, :-1, :-1]
+    known = (segment_information + (parts.information - segment_information.sum(axis=0)) / n) * t[:, None] * t
+    left = (known - known @ inverse @ known).sum(axis=0)
+    return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
+
+
+def spread_covariance(problem: Problem, outcome: Outcome, b: np.ndarray) -> np.ndarray:
+    """S^-1 (sum b_g b_g^T) S^-1 for gradients b (G, B) and the information S of `outcome`; zero along fixed
+    directions."""
+    t = problem.tolerance
+    inverse = restricted_inverse(outcome.information * t[:, None] * t, problem.fixed_directions)
+    half = t[:, None] * (inverse @ (t[:, None] * b.T))
+    return half @ half.T
+
+
+# Cluster-robust covariances, for errors that correlate within clusters such as a region of the image or of the target.
+#
+# A lens that its model does not fit, or a target that is not as drawn, makes the same errors in all segments of a
+# recording. The scatter over segments does not show them. The gradient of a cluster would be zero but for noise.
+# Measurements in no cluster, such as those of the IMU, form one more cluster, unless the clusters are a sample (Liang
+# and Zeger 1986).
+
+
+@dataclass(frozen=True)
+class ClusterCovariances:
+    """Cluster-robust covariances (B, B). regions: one for each way to divide images or target into regions, such as
+    image cells. tracks: for groups of feature tracks, None without tracks."""
+
+    regions: list[np.ndarray]
+    tracks: np.ndarray | None
+
+
+def cluster_covariances(problem: Problem, outcome: Outcome) -> ClusterCovariances:
+    """Cluster-robust (sandwich) covariances of the calibration parameters."""
+    every = [c for model in models().values() for c in model.clusters(problem.factors)]
+    gradients = _cluster_gradients(problem, outcome, [c.of_factor for c in every]) if every else []
+    regions, tracks = [], None
+    for clusters, b in zip(every, gradients, strict=True):
+        if clusters.is_sample:
+            centred = b - b.mean(axis=0)
+            tracks = len(b) / (len(b) - 1.0) * spread_covariance(problem, outcome, centred)
+        else:
+            regions.append(spread_covariance(problem, outcome, np.vstack([b, -b.sum(axis=0)])))
+    return ClusterCovariances(regions, tracks)
+
+
+def _count(clusters: Mapping[FactorKey, Any]) -> int:
+    """Number of clusters."""
+    arrays = [a for labels in clusters.values() for a in (labels if isinstance(labels, list) else [labels])]
+    return 1 + max(int(a.max(initial=-1)) for a in arrays)
+
+
+def _cluster_gradients(
+    problem: Problem, outcome: Outcome, kinds: Sequence[Mapping[FactorKey, Any]]
+) -> list[np.ndarray]:
+    """Gradient of each cluster, (clusters, B) for each of `kinds`; chain and points are marginalised.
+
+    Each cluster gets a column beside the calibration parameters, with its gradient as the right-hand side. Eliminating
+    the chain and the points then marginalises all gradients at once.
+    """
+    counts = [_count(kind) for kind in kinds]
+    B, state, at = problem.layout.size, outcome.state, problem.reusable_output(outcome.residuals)
+    starts = B + np.cumsum([0, *counts])
+
+    def segment(first: int, last: int) -> Piece:
+        piece = problem.piece_with_columns(state, first, last, sum(counts), at)
+        for kind, n, column in zip(kinds, counts, starts[:-1].tolist(), strict=True):
+            for key, cluster in kind.items():
+                factor: Any = problem.factors[key]  # it has `accumulate_clusters`
+                factor.accumulate_clusters(state, piece, at[key], cluster, n, column)
+        return piece
+
+    rest = problem.marginal(segment)
+    return [rest[:B, a:b].T for a, b in pairwise(starts)]
 
 
 # Weights of priors on nuisance parameters, if errors of measurements exceed the stated noise.

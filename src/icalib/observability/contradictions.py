@@ -15,7 +15,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.estimate.residual_statistics import fits
 from icalib.geometry import so3
-from icalib.observability.determination import Determined, classify_directions, determine, scatter
+from icalib.observability.determination import Determined, classify_directions, determine, error_covariance
 from icalib.observability.prior_sensitivity import (
     Relaxed,
     freed_inputs,
@@ -100,7 +100,7 @@ def _linear(
     root = restricted_root(information, null_space)
     step, sigma = np.zeros(n), np.zeros(n)
     step[columns] = -t * (root @ (root.T @ (t * gradient[columns])))
-    sigma[columns] = t * np.sqrt(np.diag(scatter(information - noise, noise, null_space)))
+    sigma[columns] = t * np.sqrt(np.diag(error_covariance(information - noise, noise, null_space)))
     return [
         _difference(inputs, relaxed_rig.state, relaxed_rig.layout.block(*c.key), step, sigma, factor)
         for c in significant

@@ -83,11 +83,14 @@ class Determined:
         """(B, B) with priors: covariance of the observable directions plus the consider covariance of the fixed
         ones."""
         t = self.estimate.problem.tolerance
-        return t[:, None] * scatter(self._known, self.noise, self.fixed_directions) * t + self.shifts.T @ self.shifts
+        return (
+            t[:, None] * error_covariance(self._known, self.noise, self.fixed_directions) * t
+            + self.shifts.T @ self.shifts
+        )
 
     def prior_variance(self, sensor: str | None = None) -> np.ndarray:
         """(B,) contribution of the priors on nuisance parameters, of `sensor` or of all, to the diagonal of the
-        covariance. Information that noise in the Jacobian adds is subtracted first, as in `scatter`."""
+        covariance. Information that noise in the Jacobian adds is subtracted first, as in `error_covariance`."""
         problem = self.estimate.problem
         root = problem.tolerance[:, None] * restricted_root(self._known, self.fixed_directions)
         priors = [p for p in nuisance_priors(problem) if sensor in (None, p.block.sensor)]
@@ -103,11 +106,11 @@ class Determined:
     def variances(self) -> tuple[np.ndarray, np.ndarray]:
         """(B,) variances in squared tolerances: those from the data and priors on nuisance parameters, and those from
         errors of the guess along the fixed directions (consider covariance)."""
-        by_data = np.diag(scatter(self.data, self.noise, self.fixed_directions))
+        by_data = np.diag(error_covariance(self.data, self.noise, self.fixed_directions))
         return by_data, ((self.shifts / self.estimate.problem.tolerance) ** 2).sum(axis=0)
 
 
-def scatter(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
+def error_covariance(known: np.ndarray, noise: np.ndarray, fixed_directions: np.ndarray) -> np.ndarray:
     """(B, B) covariance in tolerance units if the information J^T J is `known` + `noise`, with zero variance along
     `fixed_directions` (B, m).
 

@@ -34,7 +34,82 @@ from icalib.validation.guesses import (
     stated_words,
 )
 
-# Possible causes of large residuals, ranked by the part of the misfit that they explain.
+IMAGE_KINDS = ("corners", "features")
+
+
+def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
+    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
+
+    against: values of the rig file that contradict an estimate without any of its values. Such an estimate is made only
+    if the first one fails or fits poorly. If `against` is empty, contradictions are searched here.
+
+    If it is not empty, its causes are grave, and tests that these values may distort are skipped. These are tests of
+    the target size, of changes over the recording, and of residuals of other kinds than IMAGE_KINDS.
+    """
+    stated, notes = _stated(assessed, against)
+    omitted = {kind for a in assessments(assessed) for kind in a.unreliable}
+    fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
+    misfit = Misfit.of(fits)
+    known = stated
+    if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
+        scattering = assessed.factor > LARGE_FACTOR
+        known = [*stated, *changing(assessed, misfit, scattering)]
+    both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, explaining(known, misfit))])
+    return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
+
+
+def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
+    """Causes that are wrong values in the rig file: target size, scales, those that each kind of sensor tests, other
+    values; and notes on the size."""
+    inputs, factor = assessed.inputs, assessed.factor
+    size = None if inputs.rig.assumes_motion else felt_size(assessed.estimate, factor)
+    wrong_size, notes = ((), ()) if against else size_words(inputs, size)
+    # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
+    certain, given = is_certain(size), bool(against)
+    relaxed_rig = None if given else relaxed(inputs, assessed.estimate)
+    scale = max(factor, assessed.misfit_factor)
+    against = against or contradictions(inputs, relaxed_rig, scale)
+    if certain:  # a wrong size also changes lever arms
+        against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
+    causes: list[Cause] = []
+    if size is not None:
+        gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
+        causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
+    causes += scale_causes(inputs, assessed.groups, size)
+    for assessment in assessments(replace(assessed, relaxed_rig=None if certain else relaxed_rig)):
+        causes += assessment.causes
+    explained = {key for cause in causes for key in cause.explains}
+    against = tuple(c for c in against if c.key not in explained)
+    causes += _contradicted(assessed, against, scale, certain or given, relaxed_rig)
+    return causes, (*notes, *scale_notes(inputs, size))
+
+
+def _contradicted(
+    assessed: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, relaxed_rig: Relaxed | None
+) -> Iterator[Cause]:
+    """A cause for each contradicted value in `against`, then for absurd values. scale: factor on formal standard
+    deviations; grave: whether all of them are grave. relaxed_rig: None if gains are unknown, which
+    then count as infinite."""
+    for c in against:
+        gain = np.inf if relaxed_rig is None else float(((c.off / (c.sigma / scale)) ** 2).max())
+        moves = relaxed_rig is not None and _moves_others(assessed, relaxed_rig, c.key)
+        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves)
+    yield from (Cause(s, 0.0, grave) for s in absurd_values(assessed.inputs, against, assessed.groups))
+
+
+def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) -> bool:
+    """Whether the stated value of the group `key` distorts the result: without it, a parameter of another group moves
+    by more than SIGMAS printed standard deviations."""
+    step, _ = relaxed_rig.step([key])
+    for g in assessed.groups:
+        if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:
+            continue
+        if (np.abs(step[relaxed_rig.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():
+            return True
+    return False
+
+
+# The misfit, and the part of it that a cause explains.
 #
 # A cause is tested by its gain: the decrease of chi^2 if the cause is modelled. A significant cause that explains
 # hardly any of the misfit is not named. If no cause explains the misfit, the message says so and lists the checks.
@@ -95,6 +170,9 @@ def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
     return any(c.gain >= EXPLAINS * misfit.chi2 for c in causes)
 
 
+# Causes that vary over the recording.
+
+
 def changing(assessed: AssessedEstimate, misfit: Misfit, scattering: bool) -> Iterator[Cause]:
     """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
@@ -128,55 +206,6 @@ def _is_large(c: Change, segments: Segments) -> bool:
     """Whether a parameter changes by more than LARGE tolerances."""
     tolerance = segments.problem.tolerance[segments.problem.layout.columns(c.sensors[0], c.name)]
     return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
-
-
-def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> Remark:
-    """A sentence that the stated noise is too small, as readings show, or too large, as residuals show. scales: fitting
-    over stated density by kind of INERTIAL. Bias random walks are not shown: they become larger, too, never smaller."""
-    is_small, n = max(scales.values()) > 1.0, imu.noise
-    gyro, accel = (scales[kind] for kind in INERTIAL)
-    fields = (
-        f"gyro: {gyro * n.gyro:.2g}, gyro_walk: {max(gyro, 1.0) * n.gyro_walk:.2g}, accel: {accel * n.accel:.2g}, "
-        f"accel_walk: {max(accel, 1.0) * n.accel_walk:.2g}"
-    )
-    sentence = (
-        f"the stated noise of {imu.name} is too {'small' if is_small else 'large'}: "
-        f"over the stated one, {'readings in quiet moments show at least' if is_small else 'residuals show at most'} "
-        f"{', '.join(f'{kind} {scale:.2g}x' for kind, scale in scales.items())}. Write noise: {{{fields}}} "
-        "and calibrate again."
-    )
-    return Remark("imu_noise_understated", sentence) if is_small else Remark("imu_noise_overstated", sentence)
-
-
-def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
-    """A sentence that the cause is unknown, with the checks that were made."""
-    checks = {
-        "noise of the readings, fixed values and priors": True,
-        "target size": rig.has_target,
-        "camera models, rolling shutters, and lenses that change": bool(rig.cameras),
-        "swapped cameras": len(rig.cameras) > 1,
-        "clocks that drift or jump, mounts that move, disturbances at one time": True,
-    }
-    return Remark(
-        "residuals_unexplained",
-        f"residuals are larger than the stated noise predicts ({misfit.words}); the cause is unknown. "
-        f"Checked: {', '.join(check for check, made in checks.items() if made)}. Do not state more noise than "
-        "readings show: errors would stay larger than the standard deviations. Record again, with slower motion and "
-        "firm mounts, and compare both results by icalib compare.",
-    )
-
-
-def _hit_words(hit: Disturbance, timeline: Timeline) -> Remark:
-    """A sentence on a disturbance at one time."""
-    names = " and ".join(hit.sensors)
-    part = "leave that part out"
-    if timeline.can_be_cut:
-        part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
-    return Remark(
-        "disturbance_at_one_time",
-        f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
-        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}.",
-    )
 
 
 def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> Remark:
@@ -252,84 +281,6 @@ def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
     return sizes["rotation"], sizes["translation"]
 
 
-# All possible causes of a wrong result, ranked: wrong values in the rig file, changes over the recording, other
-# misfit.
-
-IMAGE_KINDS = ("corners", "features")
-
-
-def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
-    """All causes, the grave ones first, then by decreasing gain; and notes on the size of the target.
-
-    against: values of the rig file that contradict an estimate without any of its values. Such an estimate is made only
-    if the first one fails or fits poorly. If `against` is empty, contradictions are searched here.
-
-    If it is not empty, its causes are grave, and tests that these values may distort are skipped. These are tests of
-    the target size, of changes over the recording, and of residuals of other kinds than IMAGE_KINDS.
-    """
-    stated, notes = _stated(assessed, against)
-    omitted = {kind for a in assessments(assessed) for kind in a.unreliable}
-    fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
-    misfit = Misfit.of(fits)
-    known = stated
-    if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
-        scattering = assessed.factor > LARGE_FACTOR
-        known = [*stated, *changing(assessed, misfit, scattering)]
-    both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), explaining(known, misfit))])
-    return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
-
-
-def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
-    """Causes that are wrong values in the rig file: target size, scales, those that each kind of sensor tests, other
-    values; and notes on the size."""
-    inputs, factor = assessed.inputs, assessed.factor
-    size = None if inputs.rig.assumes_motion else felt_size(assessed.estimate, factor)
-    wrong_size, notes = ((), ()) if against else size_words(inputs, size)
-    # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
-    certain, given = is_certain(size), bool(against)
-    relaxed_rig = None if given else relaxed(inputs, assessed.estimate)
-    scale = max(factor, assessed.misfit_factor)
-    against = against or contradictions(inputs, relaxed_rig, scale)
-    if certain:  # a wrong size also changes lever arms
-        against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
-    causes: list[Cause] = []
-    if size is not None:
-        gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
-        causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
-    causes += scale_causes(inputs, assessed.groups, size)
-    for assessment in assessments(replace(assessed, relaxed_rig=None if certain else relaxed_rig)):
-        causes += assessment.causes
-    explained = {key for cause in causes for key in cause.explains}
-    against = tuple(c for c in against if c.key not in explained)
-    causes += _contradicted(assessed, against, scale, certain or given, relaxed_rig)
-    return causes, (*notes, *scale_notes(inputs, size))
-
-
-def _contradicted(
-    assessed: AssessedEstimate, against: Sequence[Contradiction], scale: float, grave: bool, relaxed_rig: Relaxed | None
-) -> Iterator[Cause]:
-    """A cause for each contradicted value in `against`, then for absurd values. scale: factor on formal standard
-    deviations; grave: whether all of them are grave. relaxed_rig: None if gains are unknown, which
-    then count as infinite."""
-    for c in against:
-        gain = np.inf if relaxed_rig is None else float(((c.off / (c.sigma / scale)) ** 2).max())
-        moves = relaxed_rig is not None and _moves_others(assessed, relaxed_rig, c.key)
-        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves)
-    yield from (Cause(s, 0.0, grave) for s in absurd_values(assessed.inputs, against, assessed.groups))
-
-
-def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) -> bool:
-    """Whether the stated value of the group `key` distorts the result: without it, a parameter of another group moves
-    by more than SIGMAS printed standard deviations."""
-    step, _ = relaxed_rig.step([key])
-    for g in assessed.groups:
-        if g.columns is None or (g.sensor, g.name) == key or g.name in AUXILIARY:
-            continue
-        if (np.abs(step[relaxed_rig.layout.columns(g.sensor, g.name)]) > SIGMAS * g.std).any():
-            return True
-    return False
-
-
 # Misfit that is concentrated at one time.
 
 BINS, WINDOWS = 64, (3, 6, 9)  # bins of the recording, and of a window: a shock affects a few keyframes around it
@@ -384,6 +335,19 @@ def _chi2_over_time(estimate: Estimate) -> dict[str, tuple[np.ndarray, np.ndarra
     }
 
 
+def _hit_words(hit: Disturbance, timeline: Timeline) -> Remark:
+    """A sentence on a disturbance at one time."""
+    names = " and ".join(hit.sensors)
+    part = "leave that part out"
+    if timeline.can_be_cut:
+        part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
+    return Remark(
+        "disturbance_at_one_time",
+        f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
+        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}.",
+    )
+
+
 # Causes and warnings for residuals that differ from the stated noise.
 
 LARGE_FACTOR = 3.0  # empirical factor; a warning above it
@@ -396,13 +360,13 @@ MAX_VARIATION = 3.0  # mean square of a segment over that of the recording, or i
 BEYOND_FACTOR = 1.5  # times the largest empirical factor; a warning if the cross-validation factor is above it
 
 
-def misfit_causes(assessed: AssessedEstimate, explained: bool) -> Iterator[Cause]:
+def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -> Iterator[Cause]:
     """Causes of the misfit: rejected outliers, the noise of the IMU, stated noise of other sensors, or unknown.
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
     rig, fits = assessed.inputs.rig, assessed.fits
     yield from (Cause(sentence, 0.0) for a in assessments(assessed) for sentence in a.many_rejected)
-    misfit, scatter = Misfit.of(fits), _scatter_over_stated(assessed.inputs)
-    noise = list(_noise_of_imu(assessed, scatter))
+    scatter = _scatter_over_stated(assessed.inputs)
+    noise = list(_noise_of_imu(assessed, misfit, scatter))
     yield from noise
     if explained:
         if misfit.fits:
@@ -429,7 +393,7 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> Remark | None:
     return assessors()[sensor.sensor_type].misfit(sensor, f, is_noise)
 
 
-def _noise_of_imu(assessed: AssessedEstimate, scatter: Mapping[str, float]) -> Iterator[Cause]:
+def _noise_of_imu(assessed: AssessedEstimate, misfit: Misfit, scatter: Mapping[str, float]) -> Iterator[Cause]:
     """Causes that are noise of the IMU, stated too small or too large. Another noise is advised only if the readings
     show it by themselves. scatter: see `_scatter_over_stated`."""
     imu, imu_fits = assessed.inputs.rig.imu, [f for f in assessed.fits if f.kind in INERTIAL]
@@ -439,7 +403,6 @@ def _noise_of_imu(assessed: AssessedEstimate, scatter: Mapping[str, float]) -> I
     overstated = tuple(s for a in assessments(assessed) for s in a.overstated_noise)
     if any(scatter[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
         scales = {kind: max(s, 1.0) for kind, s in scatter.items()}
-        misfit = Misfit.of(assessed.fits)
         yield Cause(noise_words(imu, scales), misfit.chi2, misfit.is_grave)
     elif overstated:  # the trajectory then follows the IMU, and its residuals become small
         yield from (Cause(sentence, 0.0) for sentence in overstated)
@@ -458,12 +421,48 @@ def _noise_of_imu(assessed: AssessedEstimate, scatter: Mapping[str, float]) -> I
         )
 
 
+def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> Remark:
+    """A sentence that the stated noise is too small, as readings show, or too large, as residuals show. scales: fitting
+    over stated density by kind of INERTIAL. Bias random walks are not shown: they become larger, too, never smaller."""
+    is_small, n = max(scales.values()) > 1.0, imu.noise
+    gyro, accel = (scales[kind] for kind in INERTIAL)
+    fields = (
+        f"gyro: {gyro * n.gyro:.2g}, gyro_walk: {max(gyro, 1.0) * n.gyro_walk:.2g}, accel: {accel * n.accel:.2g}, "
+        f"accel_walk: {max(accel, 1.0) * n.accel_walk:.2g}"
+    )
+    sentence = (
+        f"the stated noise of {imu.name} is too {'small' if is_small else 'large'}: "
+        f"over the stated one, {'readings in quiet moments show at least' if is_small else 'residuals show at most'} "
+        f"{', '.join(f'{kind} {scale:.2g}x' for kind, scale in scales.items())}. Write noise: {{{fields}}} "
+        "and calibrate again."
+    )
+    return Remark("imu_noise_understated", sentence) if is_small else Remark("imu_noise_overstated", sentence)
+
+
 def _unknown(rig: Rig, estimate: Estimate, misfit: Misfit) -> Iterator[Cause]:
     """A sentence on residuals of the IMU that are too large without a known cause. None if another sensor's are, too,
     and are white: a wrong noise of that sensor also enlarges those of the IMU."""
     large = any(f.kind in INERTIAL for f in misfit.fits)
     if large and not any(f.kind not in INERTIAL and _is_noise(estimate, f) for f in misfit.fits):
         yield Cause(unknown_words(rig, misfit), misfit.chi2, misfit.is_grave)
+
+
+def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
+    """A sentence that the cause is unknown, with the checks that were made."""
+    checks = {
+        "noise of the readings, fixed values and priors": True,
+        "target size": rig.has_target,
+        "camera models, rolling shutters, and lenses that change": bool(rig.cameras),
+        "swapped cameras": len(rig.cameras) > 1,
+        "clocks that drift or jump, mounts that move, disturbances at one time": True,
+    }
+    return Remark(
+        "residuals_unexplained",
+        f"residuals are larger than the stated noise predicts ({misfit.words}); the cause is unknown. "
+        f"Checked: {', '.join(check for check, made in checks.items() if made)}. Do not state more noise than "
+        "readings show: errors would stay larger than the standard deviations. Record again, with slower motion and "
+        "firm mounts, and compare both results by icalib compare.",
+    )
 
 
 def _scatter_over_stated(inputs: Inputs) -> dict[str, float]:

@@ -265,7 +265,7 @@ def _workspace(corners, noise, direct, poses):
 
 
 @njit(cache=True, nogil=True)
-def _fill_chain(i, poses, J_imu, J_chain):
+def _fill_pose_chain(i, poses, J_imu, J_chain):
     """Writes the Jacobian of the camera pose i into J_chain (6, w): by keyframes, then by the c `ViewPoses.columns`."""
     fill_chain(i, poses.camera, J_imu, J_chain)
     R_cam_world, p_world_cam = poses.camera.R_sensor_world[i], poses.camera.p_world_sensor[i]
@@ -316,7 +316,7 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
         _gram(J_rows, D + 1, 2 * n, G)
         if len(noise.precision):
             marginalise_shared(J_rows, D, n, work.J_shared, noise.precision, G)
-        _fill_chain(i, poses, work.J_imu, J_chain)
+        _fill_pose_chain(i, poses, work.J_imu, J_chain)
         add_gram(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], work.F, sums)
     return total
 
@@ -343,5 +343,5 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, dir
                 G[d, cluster[n0 + k]] += J_rows[d, k] * J_rows[D, k] + J_rows[d, n + k] * J_rows[D, n + k]
         if len(noise.precision):
             marginalise_gradients(J_rows, D, n, work.J_shared, noise.precision, cluster[n0:n1], G)
-        _fill_chain(i, poses, work.J_imu, J_chain)
+        _fill_pose_chain(i, poses, work.J_imu, J_chain)
         add_gradients(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], column, sums)

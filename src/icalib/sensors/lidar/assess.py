@@ -38,6 +38,16 @@ SIGNIFICANT_STRETCH = 10.0  # standard deviations: residuals of points in one sc
 HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of residuals by time
 
 
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        planes=planes(a.inputs, a.estimate.outcome.state),
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
     """The estimated planes, with their numbers of points."""
     association = inputs.association
@@ -242,16 +252,6 @@ def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> Remark | None:
 def length(lidar: Lidar, rig: Rig) -> str | None:
     """The source of the scale, as text for messages."""
     return f"the ranges of {lidar.name}"
-
-
-def assess(a: AssessedEstimate) -> Assessment:
-    """What results say of this kind of sensor."""
-    return Assessment(
-        planes=planes(a.inputs, a.estimate.outcome.state),
-        residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
-        warnings=warnings(a.inputs, a.estimate),
-    )
 
 
 ASSESSOR = Assessor(assess, misfit, length=length)

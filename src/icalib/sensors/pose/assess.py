@@ -29,6 +29,14 @@ MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
 COVERED_SIGMAS = 2.5
 
 
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
     """One note for each pose sensor: number of poses (or relative poses) used, and their noise."""
     counts = {
@@ -164,14 +172,6 @@ def misfit(sensor: PoseSensor, f: SensorFit, is_noise: bool) -> Remark | None:
 def length(sensor: PoseSensor, rig: Rig) -> str | None:
     """Words for the source of the metric scale."""
     return f"the positions of {sensor.name}"
-
-
-def assess(a: AssessedEstimate) -> Assessment:
-    """What results say of this kind of sensor."""
-    return Assessment(
-        notes=notes(a.inputs, a.estimate, a.timeline),
-        warnings=warnings(a.inputs, a.estimate),
-    )
 
 
 ASSESSOR = Assessor(assess, misfit, inner_contradictions=inner_contradictions, length=length)

@@ -31,6 +31,15 @@ SAME_SCALE_S = 0.5  # largest distance of a time offset from one of SCALES: rece
 LABELS = {"horizontal": ("east", "north"), "vertical": ("up",)}
 
 
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """Residuals of each position sensor, along the axes of its frame."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
@@ -121,15 +130,6 @@ def misfit(sensor: PositionSensor, f: SensorFit, is_noise: bool) -> Remark | Non
 def length(sensor: PositionSensor, rig: Rig) -> str | None:
     """The measurements of this sensor that make the metric scale observable, as words of a sentence."""
     return f"the positions of {sensor.name}"
-
-
-def assess(a: AssessedEstimate) -> Assessment:
-    """What results say of this kind of sensor."""
-    return Assessment(
-        residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
-        warnings=warnings(a.inputs, a.estimate),
-    )
 
 
 ASSESSOR = Assessor(assess, misfit, length=length)

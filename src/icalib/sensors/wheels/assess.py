@@ -45,6 +45,15 @@ RATE_UNIT_FACTORS = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
 UNIT_TOLERANCE = 0.1  # relative deviation of a size ratio from the factor of a wrong unit
 
 
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        warnings=warnings(a.inputs, a.estimate),
+    )
+
+
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
     """The residuals of each set of wheels, one row per interval between keyframes; the measured slip is 0."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, WheelFactor):
@@ -204,15 +213,6 @@ def looks_like(wheels: Wheels, name: str, value: np.ndarray, estimated: np.ndarr
         if is_near(estimated, factor * value, UNIT_TOLERANCE):
             return f" Its readings look like {unit}: write rate_unit: {unit}."
     return ""
-
-
-def assess(a: AssessedEstimate) -> Assessment:
-    """What results say of this kind of sensor."""
-    return Assessment(
-        residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
-        warnings=warnings(a.inputs, a.estimate),
-    )
 
 
 ASSESSOR = Assessor(assess, misfit, length=length, sizes=sizes, absurd=absurd, looks_like=looks_like)

@@ -35,6 +35,22 @@ from icalib.sensors.sensor import ROTATION, TRANSLATION
 LARGE_BLOOM_PX = 0.8  # px; a warning above it: ink and overexposure shift edges by about a third of it
 
 
+def assess(a: AssessedEstimate) -> Assessment:
+    """What results say of this kind of sensor."""
+    return Assessment(
+        residuals=residuals(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.estimate, a.timeline),
+        ambiguities=ambiguities(a.inputs, a.estimate, a.fits),
+        warnings=warnings(a.inputs, a.estimate),
+        value_warnings=value_warnings(a.groups),
+        causes=causes(a),
+        clock_causes=clock_causes(a.inputs, a.estimate),
+        unreliable=unreliable(a.inputs.rig, a.estimate.problem.factors),
+        many_rejected=many_rejected(a.fits),
+        overstated_noise=overstated_noise(a.inputs.rig, a.fits),
+    )
+
+
 def causes(a: AssessedEstimate) -> Iterator[Cause]:
     """Cameras that are swapped, wrong resolutions, rolling shutters, fixed intrinsics of another camera, and camera
     models that do not follow the lens."""
@@ -532,22 +548,6 @@ def _seconds(estimate: Estimate, timeline: Timeline, index: int) -> np.ndarray:
     """(M,) instants [s] of the images of camera `index`, on the time axis of the result."""
     stream = of_type(estimate.problem.factors, CornerFactor)[index].stream
     return timeline.on_result_clock(instants(stream, estimate.outcome.state.values), timeline.recordings_of(stream.key))
-
-
-def assess(a: AssessedEstimate) -> Assessment:
-    """What results say of this kind of sensor."""
-    return Assessment(
-        residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
-        ambiguities=ambiguities(a.inputs, a.estimate, a.fits),
-        warnings=warnings(a.inputs, a.estimate),
-        value_warnings=value_warnings(a.groups),
-        causes=causes(a),
-        clock_causes=clock_causes(a.inputs, a.estimate),
-        unreliable=unreliable(a.inputs.rig, a.estimate.problem.factors),
-        many_rejected=many_rejected(a.fits),
-        overstated_noise=overstated_noise(a.inputs.rig, a.fits),
-    )
 
 
 ASSESSOR = Assessor(assess, misfit, keyframe_instants=keyframe_instants, length=length, is_far_guess=is_far_guess)

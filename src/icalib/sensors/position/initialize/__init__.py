@@ -61,7 +61,7 @@ from icalib.sensors.position.initialize.attitude import (
     change_of_acceleration,
     first_unknowns,
     fit_window,
-    likely_offsets,
+    offsets_by_jerk,
     recorded,
     sigmas,
     varies,
@@ -280,7 +280,7 @@ def _candidate_offsets(motion: EstimatedMotion, fix: Fix, known: KnownPlace) -> 
     third differences with the IMU's readings. Speeds differ where the rig turns on the spot, by the lever arm."""
     if known.offset is not None:
         return [known.offset]
-    by_acceleration = [fix.same_clock, *(x.samples / SIGNAL_RATE_HZ for x in likely_offsets(motion.imu, fix))]
+    by_acceleration = [fix.same_clock, *(x.samples / SIGNAL_RATE_HZ for x in offsets_by_jerk(motion.imu, fix))]
     state = motion.state
     motion_speeds = _speeds(state.seconds, state.position, np.zeros(len(state.seconds)))
     fix_speeds = _speeds(fix.t, fix.position, fix.run)
@@ -527,7 +527,7 @@ def _offsets_with_imu(imu: ImuData, fix: Fix, known: KnownExtrinsics) -> list[fl
     """Time offsets to be tried [s]: the known one, or the highest correlations."""
     if known.offset is not None:
         return [known.offset]
-    likely = [s.samples / SIGNAL_RATE_HZ for s in likely_offsets(imu, fix) if s.correlation > MIN_JERK_CORRELATION]
+    likely = [s.samples / SIGNAL_RATE_HZ for s in offsets_by_jerk(imu, fix) if s.correlation > MIN_JERK_CORRELATION]
     return [*likely[:MAX_OFFSETS_TRIED], fix.same_clock]
 
 

@@ -338,7 +338,7 @@ MIN_SIGNAL_RANGE = 1e-4  # m/s^2 or m/s: less is rounding
 MAX_JERK_RATIO, MIN_JERK_LIMIT_M_S2 = 1.5, 5.0
 
 
-def likely_offsets(imu: ImuData, fix: Fix) -> list[CorrelationPeak]:
+def offsets_by_jerk(imu: ImuData, fix: Fix) -> list[CorrelationPeak]:
     """Candidate offsets t_imu - t_sensor in samples of 1 / SIGNAL_RATE_HZ s, the highest correlation first."""
     fix_signal, fix_known = _of_fixes(fix)
     imu_signal, imu_known = _of_imu(imu)
