@@ -21,6 +21,7 @@ import effects
 import numpy as np
 from scipy.signal import lfilter
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import CornerStream, ImuStream, Measurements, PoseStream, WheelStream
 from icalib.errors import CalibrationError
 from icalib.pipeline import calibrate_measurements
@@ -32,25 +33,28 @@ from icalib.tools.simulation import Simulation, simulate
 RIGS = tuple(effects.KINDS)[:5] + ("camera + wheels",)
 CAMERA, POSES, WHEELS = "camera + IMU", "poses + IMU", "wheels + poses + IMU"
 
-# What a sentence names as the cause, by the words it is known by.
-CAUSES = {
-    "drift": r"drifts against",
-    "step": r"time offset of .* changes|clock jumped",
-    "mount": r"moves on its mount",
-    "lens": r"its lens by up to|camera model",
-    "jitter": r"jitter",
-    "noise too small": r"noise of imu0 is too small|noise .* below what|too small: its readings",
-    "noise too large": r"noise of imu0 is too large|larger than .* readings|smaller than the stated noise",
-    "other noise": r"corner_noise_px:|position_noise:|rotation_noise:|range_noise_m:|wheel_noise:|state a larger one",
-    "low-pass": r"low-pass|filters? its readings",
-    "one time": r"comes at one time",
-    "wheel": r"its radii|stuck|repeats? a reading|stops? counting",
+# Identifiers of the sentences that name a cause.
+CAUSES: dict[str, frozenset[str]] = {
+    "drift": frozenset({"clock_drifts"}),
+    "step": frozenset({"clock_jumps"}),
+    "mount": frozenset({"mount_moves"}),
+    "lens": frozenset({"lens_changes", "lens_model_wrong", "fixed_intrinsics_wrong", "resolution_wrong"}),
+    "rows": frozenset({"rolling_shutter", "cameras_not_simultaneous"}),
+    "jitter": frozenset({"image_stamps_jitter", "stamps_jitter"}),
+    "noise too small": frozenset({"imu_noise_understated"}),
+    "noise too large": frozenset({"imu_noise_overstated", "imu_residuals_small"}),
+    "other noise": frozenset(f"{kind}_noise_understated" for kind in ("corner", "range", "pose", "position", "wheel")),
+    "one time": frozenset({"disturbance_at_one_time"}),
+    "wheel": frozenset({"wheel_sizes_change", "wheel_reading_constant", "wheel_sizes_implausible"}),
+    "target": frozenset({"target_size_wrong"}),
+    "swapped": frozenset({"cameras_swapped"}),
+    "stated": frozenset({"fixed_value_contradicted", "prior_contradicted", "lengths_contradict"}),
+}
+# What a refusal names, by the words it is known by: errors have no identifiers.
+REFUSED_FOR = {
     "convention": r"invert|w first|Euler|rotations:",
     "unit": r"deg/s|unit|millimet| mm, not",
-    "target": r"times the size",
-    "swapped": r"swapped|opposite direction",
     "vehicle": r"same vehicle|same recording",
-    "scale": r"scale of",
 }
 
 
@@ -218,8 +222,10 @@ def reasons(case: Case) -> tuple[str, tuple[str, ...]]:
 
 
 def named(sentence: str) -> set[str]:
-    """The causes that a sentence names."""
-    return {cause for cause, words in CAUSES.items() if re.search(words, sentence) and "unknown" not in sentence}
+    """The causes that a sentence names: a `Remark` by its identifier, a refusal by its words."""
+    if isinstance(sentence, Remark):
+        return {cause for cause, names in CAUSES.items() if sentence.name in names}
+    return {cause for cause, words in REFUSED_FOR.items() if re.search(words, sentence)}
 
 
 def row(name: str, seed: int, fault: Fault | None, rig: str) -> str:
