@@ -8,7 +8,7 @@ import yaml
 
 from icalib.pipeline import calibrate_measurements
 from icalib.result.saving import calibration_yaml, parameter_keys
-from icalib.result.verdict import by_size, worst
+from icalib.result.verdict import component_verdict, worst
 from icalib.rig.rig import ALL_SPECS, SENSOR_TYPES
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.simulate import SimPositions
@@ -39,7 +39,7 @@ def test_every_parameter_of_a_robot_is_in_its_result(robot):
             assert (g.unit, g.labels) == (spec.unit, spec.labels)
             tolerance = rig.settings.tolerance(spec.tolerance) if isinstance(spec.tolerance, str) else spec.tolerance
             for verdict, size in zip(g.verdict, g.std / np.array(tolerance), strict=True):
-                assert worst((verdict, by_size(float(size)))) == verdict
+                assert worst((verdict, component_verdict(float(size)))) == verdict
             assert true_value(simulation.truth, sensor.name, spec.name) is not None
             if {*g.verdict} == {"fixed"}:
                 continue

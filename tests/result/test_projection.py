@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.result import Calibration, projection_uncertainty
-from icalib.result.verdict import projection_std, working_distance
+from icalib.result.derived import projection_std, working_distance
 
 pytestmark = pytest.mark.slow
 

@@ -18,7 +18,7 @@ from icalib.cli.console import print_result, print_warnings
 from icalib.report import report_html
 from icalib.result import Calibration, load_calibration, relative_pose, verdict
 from icalib.result.quantities import rows
-from icalib.result.verdict import EXIT_CODES, NEXT, by_size, lens_projection_px
+from icalib.result.verdict import EXIT_CODES, NEXT, component_verdict, lens_projection_px
 from icalib.sensors.imu.spec import class_imperfections
 
 LARGE = remark("it is too large.")
@@ -209,8 +209,8 @@ def test_quiet_leaves_warnings_on_standard_error(cases: dict[str, Calibration], 
 )
 def test_a_component_is_judged_by_its_printed_size(size: float, verdict: str):
     """Above ten tolerances it is unobservable if the guess is most of its variance."""
-    assert by_size(size) == verdict
-    assert by_size(size, by_guess=True) == verdict.replace("too uncertain", "unobservable")
+    assert component_verdict(size) == verdict
+    assert component_verdict(size, by_guess=True) == verdict.replace("too uncertain", "unobservable")
 
 
 def test_the_baseline_is_that_of_samples(calibration: Calibration):

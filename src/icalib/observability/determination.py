@@ -34,7 +34,7 @@ from icalib.optim.arrowhead import (
 )
 from icalib.optim.state import Key, State
 from icalib.result import Verdict
-from icalib.result.verdict import by_size, in_null_space
+from icalib.result.verdict import component_verdict, in_null_space
 from icalib.rig import ParameterSpec
 
 # The null space of the data, and estimates in which it is fixed at the initial guess.
@@ -382,7 +382,9 @@ class Observability:
     def verdicts(self, columns: np.ndarray, sizes: np.ndarray) -> tuple[Verdict, ...]:
         """(n,) verdicts on the parameters of `columns` (n,) with standard deviations of `sizes` (n,) tolerances."""
         entries = zip(self.in_null_space[columns], self.by_guess[columns], sizes.tolist(), strict=True)
-        return tuple("unobservable" if is_null else by_size(size, bool(guess)) for is_null, guess, size in entries)
+        return tuple(
+            "unobservable" if is_null else component_verdict(size, bool(guess)) for is_null, guess, size in entries
+        )
 
 
 def observe(

@@ -61,7 +61,7 @@ from icalib.result.verdict import (
     NEXT,
     UNUSABLE,
     Usability,
-    by_size,
+    component_verdict,
     counted,
     lens_projection_px,
     lens_verdict,
@@ -250,7 +250,7 @@ def camera_pairs(c: Calibration) -> Html:
 def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
     """Verdict on a relative pose, by its largest standard deviation in tolerances of the rig file's settings."""
     turn, move = np.deg2rad(tolerance(c, "rotation_tolerance_deg")), tolerance(c, "translation_tolerance_m")
-    return by_size(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
+    return component_verdict(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
 
 
 def _card(c: Calibration, sensor: str) -> Html:

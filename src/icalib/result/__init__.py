@@ -14,8 +14,7 @@ from icalib.result.calibration import (
     Visited,
     by_key,
 )
-from icalib.result.saving import calibration_files, load_calibration
-from icalib.result.verdict import (
+from icalib.result.derived import (
     ProjectionMap,
     RelativePose,
     joint_covariance,
@@ -24,6 +23,7 @@ from icalib.result.verdict import (
     relative_poses,
     working_distance,
 )
+from icalib.result.saving import calibration_files, load_calibration
 from icalib.sensors.stream import Residuals, RowResiduals
 
 __all__ = [

@@ -28,7 +28,7 @@ from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.sensors.stream import Residuals, RowResiduals, Shapes
 
 if TYPE_CHECKING:
-    from icalib.result.verdict import RelativePose
+    from icalib.result.derived import RelativePose
 
 
 Verdict = Literal["determined", "weak", "too uncertain", "unobservable", "fixed"]
@@ -349,7 +349,7 @@ class Calibration:
         `frame` or `sensor` may be the IMU. `np.asarray` of the returned pose is the 4x4 matrix. Raises KeyError, which
         lists the sensors.
         """
-        from icalib.result.verdict import relative_pose
+        from icalib.result.derived import relative_pose
 
         known = list(dict.fromkeys([self.reference, *self.mounted]))
         for name in (frame, sensor):

@@ -13,16 +13,8 @@ from scipy.linalg import orth
 
 from icalib.geometry import so3
 from icalib.result.calibration import Calibration, ParameterGroup, SensorFit, Verdict
-from icalib.result.verdict import (
-    by_size,
-    counted,
-    in_null_space,
-    joint_covariance,
-    pose_groups,
-    relative_jacobian,
-    tolerance,
-    worst,
-)
+from icalib.result.derived import joint_covariance, pose_groups, relative_jacobian
+from icalib.result.verdict import component_verdict, counted, in_null_space, tolerance, worst
 from icalib.rig import LENS
 from icalib.rig.rig import ONE
 from icalib.sensors.parameter import display_unit
@@ -267,7 +259,8 @@ def _pose_in_body(c: Calibration, sensor: str) -> Iterator[tuple[ParameterGroup,
         formal, std = (np.sqrt(np.einsum("ij,jk,ik->i", r, c.covariance, r)) for r in (rows, rows * scale))
         sizes, by_guess = std / _allowed(c, spec.tolerance), _by_guess(c, rows)
         verdict: tuple[Verdict, ...] = tuple(
-            "fixed" if s == 0.0 else by_size(s if c.converged else inf, g) for s, g in zip(sizes, by_guess, strict=True)
+            "fixed" if s == 0.0 else component_verdict(s if c.converged else inf, g)
+            for s, g in zip(sizes, by_guess, strict=True)
         )
         factor = np.divide(std, formal, out=np.ones(3), where=formal > 0.0)
         mode = "free" if rows.any() else "fixed"

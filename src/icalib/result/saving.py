@@ -33,8 +33,9 @@ from icalib.result.calibration import (
     by_key,
     check_arrays,
 )
+from icalib.result.derived import RelativePose, joint_covariance, relative_poses
 from icalib.result.quantities import in_body_frame
-from icalib.result.verdict import UNUSABLE, RelativePose, joint_covariance, relative_poses
+from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig, Settings
 from icalib.rig.file import rig_from_dict, rig_to_dict
 from icalib.rig.rig import ONE
