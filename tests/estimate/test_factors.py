@@ -44,6 +44,8 @@ from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.wheels.ground_factor import GroundFactor
 from icalib.sensors.wheels.residual import IncrementFactor, RelativePoseFactor, WheelNoise
 
+pytestmark = pytest.mark.slow
+
 
 @dataclass(frozen=True)
 class Sample:
