@@ -318,12 +318,13 @@ def test_kalibrs_noise_of_another_imu(draft, bags, tmp_path):
 
 
 def test_depth_images_and_odd_topics(draft, bags):
-    names = ("/depth/image", "/rig: #1/image_raw", "/rig: #1/image_raw/compressed")
-    text, path = draft([m for n in names[:2] for m in bags.noise(n, SIZE)])
+    names = ("/depth/image", "/rig: #1/image_raw", "/rig: #1/image_rect")
+    text, path = draft([m for n in names for m in bags.noise(n, SIZE)])
     fill(path)
     (camera,) = load_rig(path).cameras
     assert (camera.name, camera.topic) == ("rig_1", names[1])
     assert "# Not used: /depth/image (depth images)" in text
+    assert f"# Not used: {names[2]} (the images of rig_1 once more)" in text
 
 
 def test_a_camera_that_cannot_be_read_is_left_out(draft, bags):

@@ -53,7 +53,6 @@ def test_the_same_images_twice_are_one_camera():
     assert camera.images and camera.info
     assert (camera.images.name, camera.info.name) == ("/c/image_raw", "/c/camera_info")
     assert found.of("camera")["d"].info is None
-    assert found.left_out == {k: "the images of c once more" for k in ("/c/image_raw/compressed", "/c/image_rect")}
 
 
 def test_lidars_and_wheels():
@@ -86,7 +85,6 @@ def test_poses_and_odometry():
 def test_depth_images_are_no_camera():
     found = find_sources(topics("/d455/depth/image_rect_raw", "/d455/color/image_raw"))
     assert list(found.of("camera")) == ["color"]
-    assert found.left_out == {"/d455/depth/image_rect_raw": "depth images"}
 
 
 def test_images_and_corners_of_one_camera():

@@ -34,10 +34,13 @@ from icalib.sensors.imu.spec import (
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.console import plain_table
 from icalib.tools.inspection.facts import (
+    Draft,
     Finding,
     Inspection,
     Key,
     KindInspector,
+    Printout,
+    SensorFacts,
     SensorSource,
     Sources,
     StreamFacts,
@@ -96,10 +99,6 @@ class ImuSource(SensorSource):
     """One IMU. halves: its two topics if gyroscope and accelerometer have a topic each; `topic` is the gyroscope's."""
 
     halves: TwoSources | None = None
-
-    @property
-    def read_topic(self) -> TopicInfo:
-        return self.topic
 
 
 # Findings on IMUs: units, motion and gaps.
@@ -226,28 +225,28 @@ class ImuInspector(KindInspector):
         name = next(n for k in itertools.count() if (n := f"imu{k}") not in others)
         return dataclasses.replace(sources, sensors={name: ImuSource(self.sensor.sensor_type, gyro, pair), **others})
 
-    def read(self, recording: Recording, name: str, source: ImuSource) -> tuple[StreamFacts, ImuFacts | None]:
+    def read(self, recording: Recording, name: str, source: ImuSource) -> SensorFacts:
         """Reads all readings; no facts if they cannot be read."""
         topic = source.topic
         try:
             imu, where, notes = read_imu(recording, name, source.halves or topic.name)
         except RecordingError as error:
-            return StreamFacts(topic, None, str(error)), None
+            return SensorFacts(stream=StreamFacts(topic, None, str(error)))
         facts = imu_facts(imu, where, frame_id(recording, topic), notes)
-        return StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem), facts
+        return SensorFacts(facts, StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem))
 
-    def draft(self, inspection: Inspection, active: bool) -> Iterator[str]:
+    def draft(self, inspection: Inspection, active: bool) -> Draft:
         """Lines of the IMU to calibrate with."""
-        return imu_lines(inspection, inspection.sources.of(self.sensor.sensor_type))
+        return Draft(imu_lines(inspection, inspection.sources.of(self.sensor.sensor_type)))
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
         return {"topic": inspection.sources.sensors[name].topic.name} | plain(inspection.facts[name])
 
-    def readings_tables(self, inspection: Inspection) -> Iterator[Table]:
+    def printout(self, inspection: Inspection) -> Printout:
         """Ranges and units of the readings."""
         imus = inspection.sources.of(self.sensor.sensor_type)
-        if facts := {name: inspection.facts[name] for name in imus if inspection.facts[name] is not None}:
-            yield imu_table(facts)
+        facts = {name: inspection.facts[name] for name in imus if inspection.facts[name] is not None}
+        return Printout(readings=[imu_table(facts)] if facts else [])
 
 
 INSPECTOR = ImuInspector()

@@ -5,14 +5,29 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import ClassVar
+
+from rich.table import Table
+from rich.text import Text
 
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.errors import RecordingError
 from icalib.sensors.pose.read.transforms import TRANSFORMS, read_edges, transform_topics
 from icalib.sensors.pose.spec import PoseSensor
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.facts import FramePair, Inspection, Key, KindInspector, SensorSource, inertial
+from icalib.tools.inspection.console import plain_table
+from icalib.tools.inspection.facts import (
+    Draft,
+    FramePair,
+    Inspection,
+    Key,
+    KindInspector,
+    Printout,
+    Progress,
+    SensorSource,
+    inertial,
+)
 
 
 class PoseInspector(KindInspector):
@@ -34,10 +49,11 @@ class PoseInspector(KindInspector):
         """See `KindInspector`; odometry comes last, as the first sensor gives the trajectory without an IMU."""
         return super().sources(sorted(topics, key=_drifts))
 
-    def frames(self, recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
-        """Pairs of frames of /tf and similar topics. Both results are empty for recordings that are not bags."""
+    def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> Inspection:
+        """Adds pairs of frames of /tf and similar topics, sorted by topic and name, and notes on topics that cannot be
+        read. There are none in recordings that are not bags."""
         if not isinstance(recording, BagRecording):
-            return (), ()
+            return inspection
         topics = recording.topics()
         pairs, notes = list[FramePair](), list[str]()
         for name in sorted({t.name.removesuffix("_static") for t in topics if t.kind == TRANSFORMS and t.count}):
@@ -48,7 +64,7 @@ class PoseInspector(KindInspector):
                 continue
             for (parent, child), e in sorted(edges.items()):
                 pairs.append(FramePair(name, parent, child, len(e.stamps_ns), e.rate_hz, not e.static and e.changes))
-        return tuple(pairs), tuple(notes)
+        return replace(inspection, frames=tuple(pairs), notes=inspection.notes + tuple(notes))
 
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """The `kind` line of the draft. Without an IMU the first pose sensor gives the trajectory, so it must be
@@ -56,28 +72,35 @@ class PoseInspector(KindInspector):
         leads = not inertial(inspection) and name == next(iter(inspection.sources.of(self.sensor.sensor_type)))
         yield f"kind: {'relative' if _drifts(topic) and not leads else 'absolute'}"
 
-    def more_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
-        """Draft lines of a pose sensor from transforms, if any transform changes. Its frames are the ends of the chain
-        with most changing transforms."""
-        active = active and not inspection.sources.of(PoseSensor.sensor_type)
-        chain = _most_motion(inspection.frames)
-        if not chain:
-            return
-        topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
-        kind = "relative" if "odom" in frames[0] else "absolute"
-        if not active:
-            yield "# Poses from transforms, as of a robot arm? Then remove the #. Choose any two of the frames"
-            yield "# listed, the fixed one (base) and the moving one (docs/rig-file.md#pose-sensor)."
-        place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
-        for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
-            yield f"{'' if active else '# '}{line}"
+    def draft(self, inspection: Inspection, active: bool) -> Draft:
+        active_chain = active and not inspection.sources.of(PoseSensor.sensor_type)
+        return Draft((*super().draft(inspection, active).lines, *_chain_lines(inspection.frames, active_chain)))
+
+    def printout(self, inspection: Inspection) -> Printout:
+        return Printout(readings=[frames_table(inspection.frames)] if inspection.frames else [])
+
+
+INSPECTOR = PoseInspector()
 
 
 def _drifts(topic: TopicInfo) -> bool:
     return topic.kind == "odometry" or "odom" in topic.name
 
 
-INSPECTOR = PoseInspector()
+def _chain_lines(pairs: Sequence[FramePair], active: bool) -> Iterator[str]:
+    """Draft lines of a pose sensor from transforms, if any transform changes; comments unless `active`. Its frames are
+    the ends of the chain with most changing transforms."""
+    chain = _most_motion(pairs)
+    if not chain:
+        return
+    topic, frames = chain[0].topic, [chain[0].parent, chain[-1].child]
+    kind = "relative" if "odom" in frames[0] else "absolute"
+    if not active:
+        yield "  # Poses from transforms, as of a robot arm? Then remove the #. Choose any two of the frames"
+        yield "  # listed, the fixed one (base) and the moving one (docs/rig-file.md#pose-sensor)."
+    place = (f"  topic: {json.dumps(topic)}", f"  frames: {json.dumps(frames)}")
+    for line in ("tf0:", "  type: pose", *place, f"  kind: {kind}"):
+        yield f"  {'' if active else '# '}{line}"
 
 
 def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
@@ -95,3 +118,18 @@ def _most_motion(pairs: Sequence[FramePair]) -> list[FramePair]:
         first = next(k for k, pair in enumerate(chain) if pair.moves)
         best = max(best, chain[first:], key=lambda c: sum(pair.moves for pair in c))
     return best
+
+
+def frames_table(pairs: Sequence[FramePair]) -> Table:
+    """One row for each transform between two frames."""
+    table = plain_table(
+        "Frames",
+        ("topic", "parent -> child", "count", "rate [Hz]", "moves"),
+        right=2,
+        caption="frames of a pose sensor: any two that these connect, parent and child.",
+    )
+    for f in pairs:
+        rate = "" if f.rate_hz is None else f"{f.rate_hz:.1f}"
+        cells = (f.topic, f"{f.parent} -> {f.child}", str(f.count), rate, "yes" if f.moves else "no")
+        table.add_row(*map(Text, cells))
+    return table

@@ -24,7 +24,6 @@ from icalib.kinds import inspectors
 from icalib.rig.file import load_rig, load_target
 from icalib.tools.inspection.facts import (
     Finding,
-    FramePair,
     GivenTarget,
     Inspection,
     Key,
@@ -73,21 +72,19 @@ def inspect_recording(
         raise RecordingError(
             f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
         )
-    kinds, sources, kalibr = inspectors(), find_sources(topics), find_kalibr_files(Path(path))
-    for kind in kinds.values():
+    kinds, sources, kalibr = inspectors().values(), find_sources(topics), find_kalibr_files(Path(path))
+    for kind in kinds:
         sources = kind.joined(recording, sources)
     target = target or _beside(kalibr)
     share = READING_SHARE if target else 1.0
-    streams, content = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
-    sensors = sources.sensors.items()
-    facts = {name: kinds[s.kind].facts(recording, name, s, content.get(name)) for name, s in sensors}
+    streams, facts = _read(recording, topics, sources, lambda what, done: progress(what, share * done))
     inspection = Inspection(str(path), sources, streams, facts, _choose(facts, sources, kalibr), target, kalibr)
-    frames, frame_notes = _frames(recording)
-    for kind in kinds.values():
-        seen = kind.searched(recording, inspection, lambda what, done: progress(what, share + (1.0 - share) * done))
-        inspection = dataclasses.replace(inspection, facts={**inspection.facts, **seen})
-    notes = tuple(dict.fromkeys(recording.notes() + frame_notes)) + kalibr.notes
-    inspection = dataclasses.replace(inspection, frames=frames, notes=notes)
+    for kind in kinds:
+        inspection = kind.searched(
+            recording, inspection, lambda what, done: progress(what, share + (1.0 - share) * done)
+        )
+    notes = tuple(dict.fromkeys(recording.notes() + inspection.notes)) + kalibr.notes
+    inspection = dataclasses.replace(inspection, notes=notes)
     return dataclasses.replace(inspection, findings=findings(inspection))
 
 
@@ -99,30 +96,19 @@ def _beside(kalibr: KalibrFiles) -> GivenTarget | None:
 def _read(
     recording: Recording, topics: tuple[TopicInfo, ...], sources: Sources, progress: Progress
 ) -> tuple[tuple[StreamFacts, ...], dict[str, Any]]:
-    """Reads every topic once. Returns facts by topic, and on the content of messages by name of the sensor. Topics that
-    are no `SensorSource.read_topic` are read only for their stamps."""
-    names = {source.read_topic: name for name, source in sources.sensors.items()}
-    content: dict[str, Any] = {}
-    streams: list[StreamFacts] = []
-    for k, topic in enumerate(topics):
-        progress(f"reading {topic.name}", k / len(topics))
-        if (name := names.get(topic)) is not None:
-            source = sources.sensors[name]
-            stream, content[name] = inspectors()[source.kind].read(recording, name, source)
-        else:
-            stream = _read_stamps(recording, topic, topic.name in sources.left_out)
-        streams.append(stream)
-    return tuple(streams), content
-
-
-def _frames(recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
-    """Pairs of frames that kinds of sensors read poses from, and notes, see `KindInspector.frames`."""
-    pairs, notes = list[FramePair](), list[str]()
-    for inspector in inspectors().values():
-        frames, sentences = inspector.frames(recording)
-        pairs += frames
-        notes += sentences
-    return tuple(pairs), tuple(notes)
+    """Facts by topic, and facts of the kind by name of the sensor. Topics that their sensor does not read in full are
+    read for their stamps."""
+    read: dict[TopicInfo, StreamFacts] = {}
+    facts: dict[str, Any] = {}
+    for k, (name, source) in enumerate(sources.sensors.items()):
+        progress(f"reading {source.topic.name}", k / len(topics))
+        reading = inspectors()[source.kind].read(recording, name, source)
+        facts[name] = reading.facts
+        if reading.stream is not None:
+            read[reading.stream.topic] = reading.stream
+    stamps = (t for t in topics if t not in read)
+    read |= {t: _read_stamps(recording, t, t.name in sources.left_out) for t in stamps}
+    return tuple(read[topic] for topic in topics), facts
 
 
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:
@@ -159,9 +145,7 @@ def find_sources(topics: Sequence[TopicInfo]) -> Sources:
     kinds = sorted(inspectors().values(), key=lambda kind: not kind.named_first)
     keyed = [(key, source, kind.prefix) for kind in kinds for key, source in kind.sources(filled)]
     names = _names([(key, prefix) for key, _, prefix in keyed])
-    sensors = {name: source for name, (_, source, _) in zip(names, keyed, strict=True)}
-    left_out = {topic: why for kind in kinds for topic, why in kind.left_out(filled, sensors).items()}
-    return Sources(sensors, left_out)
+    return Sources({name: source for name, (_, source, _) in zip(names, keyed, strict=True)})
 
 
 def _names(sensors: list[tuple[Key, str]]) -> list[str]:
@@ -236,12 +220,11 @@ def draft_rig(inspection: Inspection) -> str:
     # Topics that need not be sensors on the robot are comments, unless no other sensor gives the motion.
     certain = set(moving(inspection)) & set(named(inspection, lambda kind: kind.is_certain))
     active = not (usable or (inertial(inspection) and certain))
-    for kind in inspectors().values():
-        lines += kind.draft(inspection, active)
+    drafts = [kind.draft(inspection, active) for kind in inspectors().values()]
+    lines += (line for draft in drafts for line in draft.lines)
     left_out = {**broken, **inspection.sources.left_out}
     lines += [f"  # Not used: {comment(topic)} ({comment(why)})" for topic, why in left_out.items()]
-    needs_target = any(kind.needs_target(inspection) for kind in inspectors().values())
-    return "\n".join([*lines, _target(inspection) if needs_target else ""])
+    return "\n".join([*lines, _target(inspection) if any(draft.needs_target for draft in drafts) else ""])
 
 
 def _without_imu(inspection: Inspection) -> Iterator[str]:

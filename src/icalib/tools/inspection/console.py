@@ -36,13 +36,13 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
     for f in inspection.findings:
         out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
     out.print()
-    kinds = inspectors().values()
+    printouts = [kind.printout(inspection) for kind in inspectors().values()]
     tables: list[Table | Text] = [streams_table(inspection)]
-    tables += [table for kind in kinds for table in kind.readings_tables(inspection)]
-    tables += [frames_table(inspection)] if inspection.frames else []
-    for table in (*tables, *(table for kind in kinds for table in kind.target_tables(inspection))):
+    tables += (table for kind in printouts for table in kind.readings)
+    tables += (table for kind in printouts for table in kind.target)
+    for table in tables:
         _print_table(table, out)
-    for note in (*inspection.notes, *(note for kind in kinds for note in kind.notes(inspection))):
+    for note in (*inspection.notes, *(note for kind in printouts for note in kind.notes)):
         out.print(Text(f"Note: {note}"))
 
 
@@ -70,21 +70,6 @@ def streams_table(inspection: Inspection) -> Table:
     origin = _origin(inspection)
     for s in inspection.streams:
         table.add_row(*map(Text, (s.topic.name, _type(s), names.get(s.topic.name, ""), *_timing(s, origin))))
-    return table
-
-
-def frames_table(inspection: Inspection) -> Table:
-    """One row for each transform between two frames."""
-    table = plain_table(
-        "Frames",
-        ("topic", "parent -> child", "count", "rate [Hz]", "moves"),
-        right=2,
-        caption="frames of a pose sensor: any two that these connect, parent and child.",
-    )
-    for f in inspection.frames:
-        rate = "" if f.rate_hz is None else f"{f.rate_hz:.1f}"
-        cells = (f.topic, f"{f.parent} -> {f.child}", str(f.count), rate, "yes" if f.moves else "no")
-        table.add_row(*map(Text, cells))
     return table
 
 

@@ -93,11 +93,6 @@ class SensorSource:
         """The topics that are listed under the name of the sensor."""
         return (self.topic,)
 
-    @property
-    def read_topic(self) -> TopicInfo | None:
-        """The topic whose messages are read in full; None: only stamps are read."""
-        return None
-
 
 @dataclass(frozen=True)
 class Sources:
@@ -105,7 +100,7 @@ class Sources:
     that are not used, and why."""
 
     sensors: Mapping[str, SensorSource]
-    left_out: Mapping[str, str]
+    left_out: Mapping[str, str] = field(default_factory=dict)
 
     def with_kind(self, kind: str, chosen: Callable[[SensorSource], bool]) -> Sources:
         """These sources; those that are `chosen` by what they hold are of the sensor type `kind`. Unreadable ones stay
@@ -119,6 +114,15 @@ class Sources:
     def of(self, kind: str) -> dict[str, Any]:
         """Sources of the sensors of one kind, by name; their class is that of the kind."""
         return {name: source for name, source in self.sensors.items() if source.kind == kind}
+
+
+@dataclass(frozen=True)
+class SensorFacts:
+    """What the messages of a sensor show. facts: a dataclass of its kind, or None; stream: facts on the topic that was
+    read in full; None: only stamps are read."""
+
+    facts: Any = None
+    stream: StreamFacts | None = None
 
 
 @dataclass(frozen=True)
@@ -172,6 +176,24 @@ class Inspection:
 
     def stream(self, topic: TopicInfo) -> StreamFacts:
         return next(s for s in self.streams if s.topic == topic)
+
+
+@dataclass(frozen=True)
+class Draft:
+    """Lines of the sensors of one kind in a rig file, and whether it must give the target for them."""
+
+    lines: Iterable[str]
+    needs_target: bool = False
+
+
+@dataclass(frozen=True)
+class Printout:
+    """What the terminal shows of sensors of one kind: tables of their readings, then the target as they see it, then
+    notes."""
+
+    readings: Iterable[Table] = ()
+    target: Iterable[Table | Text] = ()
+    notes: Iterable[str] = ()
 
 
 GAP = 1.5  # in median intervals; one lost message makes 2
@@ -274,34 +296,25 @@ class KindInspector:
             if topic.kind in self.topic_kinds:
                 yield topic_key(topic), SensorSource(self.sensor.sensor_type, topic)
 
-    def left_out(self, topics: Sequence[TopicInfo], sensors: Mapping[str, SensorSource]) -> dict[str, str]:
-        """Topics of this kind that are not used, and why. sensors: all sensors by name."""
-        return {}
-
     def joined(self, recording: Recording, sources: Sources) -> Sources:
-        """The sources, in which topics that are parts of one sensor are joined, or belong to this kind by content."""
+        """The sources, in which topics that are parts of one sensor are joined, belong to this kind by content, or are
+        left out."""
         return sources
 
-    def read(self, recording: Recording, name: str, source: Any) -> tuple[StreamFacts, Any]:
-        """Reads all messages of `source.read_topic`: facts on the stream, and on its content for `facts`."""
-        raise NotImplementedError(type(self))
+    def read(self, recording: Recording, name: str, source: Any) -> SensorFacts:
+        """Reads the messages of the sensor as far as its kind has facts on them."""
+        return SensorFacts()
 
-    def facts(self, recording: Recording, name: str, source: Any, content: Any) -> Any:
-        """Facts on the sensor that are special to its kind: a dataclass, or None. content: result of `read`."""
-        return content
+    def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> Inspection:
+        """The inspection with what is searched for once all sensors are known: the target in images, transforms."""
+        return inspection
 
-    def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> dict[str, Any]:
-        """Facts by name of sensors, once more, after the target was searched for in their data."""
-        return {}
-
-    def frames(self, recording: Recording) -> tuple[tuple[FramePair, ...], tuple[str, ...]]:
-        """All pairs of frames with a transform in topics of `frame_topics`, sorted by topic and name. Also notes on
-        topics that cannot be read."""
-        return (), ()
-
-    def draft(self, inspection: Inspection, active: bool) -> Iterator[str]:
+    def draft(self, inspection: Inspection, active: bool) -> Draft:
         """Lines of the sensors of this kind in a rig file. Sensors that need not be on the robot are comments unless
         `active`."""
+        return Draft(self._draft_lines(inspection, active))
+
+    def _draft_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         for name, source in inspection.sources.of(self.sensor.sensor_type).items():
             if self.sensor.needs_imu and not inertial(inspection):
                 continue
@@ -311,36 +324,19 @@ class KindInspector:
             fields = (f"type: {source.kind}", place_line(topic.name, topic.type), *lines)
             for line in (f"{name}:", *(f"  {line}" for line in fields)):
                 yield f"  {'' if is_active else '# '}{line}"
-        yield from (f"  {line}" for line in self.more_lines(inspection, active))
 
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """Lines of the sensor in a rig file, except its type and its topic or path."""
         yield from ()
-
-    def more_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
-        """Lines of a rig file for sensors without a topic of this kind, name included; comments unless `active`."""
-        yield from ()
-
-    def needs_target(self, inspection: Inspection) -> bool:
-        """Whether a draft must give the target for sensors of this kind."""
-        return False
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
         """Figures of one sensor as plain data, see `console.figures`."""
         source = inspection.sources.sensors[name]
         return {"type": source.kind, "topic": source.topic.name} | plain(inspection.facts.get(name))
 
-    def readings_tables(self, inspection: Inspection) -> Iterator[Table]:
-        """Tables of the readings for the terminal."""
-        yield from ()
-
-    def target_tables(self, inspection: Inspection) -> Iterator[Table | Text]:
-        """Tables and text for the terminal on the target as the sensors see it."""
-        yield from ()
-
-    def notes(self, inspection: Inspection) -> Iterator[str]:
-        """Notes on the search for the target, for the terminal."""
-        yield from ()
+    def printout(self, inspection: Inspection) -> Printout:
+        """What the terminal shows of the sensors beside their topics."""
+        return Printout()
 
 
 @cache

@@ -17,7 +17,6 @@ from icalib.sensors.camera.inspect.facts import (
     GRID,
     CameraFacts,
     CameraSource,
-    ImageFacts,
     TargetView,
     camera_lines,
     camera_sources,
@@ -34,13 +33,15 @@ from icalib.sensors.camera.spec import Camera
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.console import plain_table
 from icalib.tools.inspection.facts import (
+    Draft,
     Finding,
     Inspection,
     Key,
     KindInspector,
+    Printout,
     Progress,
-    SensorSource,
-    StreamFacts,
+    SensorFacts,
+    Sources,
     Timing,
     imu_timing,
     inertial,
@@ -268,43 +269,37 @@ class CameraInspector(KindInspector):
     def sources(self, topics: Sequence[TopicInfo]) -> Iterator[tuple[Key, CameraSource]]:
         return camera_sources_of(topics)
 
-    def left_out(self, topics: Sequence[TopicInfo], sensors: Mapping[str, SensorSource]) -> dict[str, str]:
-        """Depth images, and further topics with the images of a camera."""
-        cameras = [(name, camera) for name, camera in sensors.items() if isinstance(camera, CameraSource)]
+    def joined(self, recording: Recording, sources: Sources) -> Sources:
+        """The sources; depth images, and further topics with the images of a camera, are left out."""
+        depth = {t.name: "depth images" for t in depth_images(recording.topics()) if t.count}
+        cameras = sources.of(Camera.sensor_type).items()
         again = {topic: f"the images of {name} once more" for name, camera in cameras for topic in camera.others}
-        return {t.name: "depth images" for t in depth_images(topics)} | again
+        return dataclasses.replace(sources, left_out={**sources.left_out, **depth, **again})
 
-    def read(self, recording: Recording, name: str, source: CameraSource) -> tuple[StreamFacts, ImageFacts]:
-        """Reads all images."""
-        assert source.images is not None  # it is the `read_topic`
-        return read_images(recording, source.images)
+    def read(self, recording: Recording, name: str, source: CameraSource) -> SensorFacts:
+        """Reads all images, and CameraInfo."""
+        stream, images = read_images(recording, source.images) if source.images else (None, None)
+        return SensorFacts(CameraFacts(images, _info(recording, source)), stream)
 
-    def facts(self, recording: Recording, name: str, source: CameraSource, content: ImageFacts | None) -> CameraFacts:
-        """Facts on the images, and CameraInfo."""
-        return CameraFacts(content, _info(recording, source))
-
-    def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> dict[str, CameraFacts]:
-        """Facts with the views of a known target, or else with words on the target in a few images."""
-        facts: dict[str, CameraFacts] = dict(inspection.facts)
+    def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> Inspection:
+        """Adds the views of a known target, or else words on the target in a few images."""
         cameras = camera_sources(inspection)
         readable = {n: c for n, c in cameras.items() if c.corners or (c.images and not problem_of(inspection, n))}
         if inspection.target is None:
             topics = {n: c.images.name for n, c in readable.items() if c.images and not c.corners}
             looks = {n: target_in(spread_images(recording, topic)) for n, topic in topics.items()}
-            return {n: dataclasses.replace(facts[n], pattern=words) for n, words in looks.items()}
-        return _with_views(recording, inspection, readable, progress)
+            seen = {n: dataclasses.replace(inspection.facts[n], pattern=words) for n, words in looks.items()}
+        else:
+            seen = _with_views(recording, inspection, readable, progress)
+        return dataclasses.replace(inspection, facts={**inspection.facts, **seen})
 
-    def draft(self, inspection: Inspection, active: bool) -> Iterator[str]:
-        """Lines of the cameras that can be read."""
-        for name, camera in _usable(inspection).items():
-            yield from camera_lines(inspection, name, camera)
-
-    def needs_target(self, inspection: Inspection) -> bool:
-        """Whether the target is known, or a camera is without tracks."""
-        cameras = _usable(inspection).values()
+    def draft(self, inspection: Inspection, active: bool) -> Draft:
+        """Lines of the cameras that can be read. They need the target if it is known, or a camera is without tracks."""
+        usable = {n: c for n, c in camera_sources(inspection).items() if not problem_of(inspection, n)}
         tracks_scene = without_target(inspection)
-        needed = any(c.tracks is None and not (tracks_scene and c.images) for c in cameras)
-        return bool(cameras) and (inspection.target is not None or needed)
+        needed = any(c.tracks is None and not (tracks_scene and c.images) for c in usable.values())
+        lines = (line for name, camera in usable.items() for line in camera_lines(inspection, name, camera))
+        return Draft(lines, needs_target=bool(usable) and (inspection.target is not None or needed))
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
         source, facts = camera_sources(inspection)[name], inspection.facts[name]
@@ -319,23 +314,15 @@ class CameraInspector(KindInspector):
             "target": (plain(facts.view) | {"grid": list(GRID)}) if facts.view else None,
         }
 
-    def target_tables(self, inspection: Inspection) -> Iterator[Table | Text]:
-        """Views of the target, and their coverage of the images."""
-        if camera_views(inspection):
-            yield target_table(inspection)
-            yield from coverage_maps(inspection)
-
-    def notes(self, inspection: Inspection) -> Iterator[str]:
-        """Notes on the search for the target."""
-        return (note for view in camera_views(inspection).values() for note in view.notes)
+    def printout(self, inspection: Inspection) -> Printout:
+        """Views of the target, their coverage of the images, and notes on the search."""
+        if not (views := camera_views(inspection)):
+            return Printout()
+        notes = [note for view in views.values() for note in view.notes]
+        return Printout(target=[target_table(inspection), *coverage_maps(inspection)], notes=notes)
 
 
 INSPECTOR = CameraInspector()
-
-
-def _usable(inspection: Inspection) -> dict[str, CameraSource]:
-    """Cameras that can be read, by name."""
-    return {name: c for name, c in camera_sources(inspection).items() if not problem_of(inspection, name)}
 
 
 def _info(recording: Recording, camera: CameraSource) -> CameraInfo | None:

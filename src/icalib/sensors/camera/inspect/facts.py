@@ -97,10 +97,6 @@ class CameraSource(SensorSource):
     def topics(self) -> tuple[TopicInfo, ...]:
         return tuple(topic for topic in (self.images, self.corners) if topic)
 
-    @property
-    def read_topic(self) -> TopicInfo | None:
-        return self.images
-
 
 def camera_sources(inspection: Inspection) -> dict[str, CameraSource]:
     """The cameras of a recording, by name."""
