@@ -72,7 +72,6 @@ def test_errors_that_an_image_shares_are_covered(count: int):
     assert not any("too short for segments" in w for r in results for w in r.warnings)
 
 
-@pytest.mark.full
 @pytest.mark.parametrize("count", COUNTS)
 def test_white_noise_costs_little_more_than_students_t(count: int):
     results = [stills(count, seed, 0.0) for seed in range(6)]

@@ -93,7 +93,6 @@ def test_without_noise_it_is_recovered(count, tmp_path):
     assert load_calibration(tmp_path).body == "cam0"
 
 
-@pytest.mark.full
 def test_nees():
     runs = []
     for seed in range(16):
