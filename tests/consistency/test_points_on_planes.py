@@ -55,6 +55,7 @@ def between(result: Calibration, simulation: Simulation) -> tuple[float, float]:
     return float(off[2]), float(np.sqrt(C[i, i] + C[j, j] - 2.0 * C[i, j]))
 
 
+@pytest.mark.full
 def test_on_a_flat_floor_they_tie_camera_and_lidar():
     """With the guess of this seed the floor is 14 cm off: its points were those of other planes, once."""
     result, simulation = calibrated(scenario_of("planar", 1), 1)

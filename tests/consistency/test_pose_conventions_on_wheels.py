@@ -24,7 +24,7 @@ def recorded(request, robot):
 
 
 @pytest.mark.parametrize(
-    ("way", "words"), [pytest.param(*x, marks=() if x[0] in (inverted, y_up) else pytest.mark.full) for x in WRONG]
+    ("way", "words"), [pytest.param(*x, marks=() if x[0] is inverted else pytest.mark.full) for x in WRONG]
 )
 def test_the_way_that_wheels_fit_is_named(recorded, way, words):
     rig, measurements, _ = recorded

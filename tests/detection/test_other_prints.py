@@ -161,7 +161,9 @@ def test_no_layout_is_named_that_the_tags_in_sight_do_not_tell_from_others():
     assert sentence == "the layout of the tags does not match cols: 5; correct rows and cols."
 
 
-@pytest.mark.parametrize(("rows", "cols"), [(6, 9), (5, 7), pytest.param(9, 6, marks=pytest.mark.full)])
+@pytest.mark.parametrize(
+    ("rows", "cols"), [(6, 9), *(pytest.param(*x, marks=pytest.mark.full) for x in ((5, 7), (9, 6)))]
+)
 def test_counted_squares_are_named(rows, cols):
     image = rendered(Checkerboard(rows, cols, 0.035))
     sentence = other_size([image], Checkerboard(rows + 1, cols + 1, 0.035))
