@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from tests.remarks import names
 from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
@@ -210,11 +211,11 @@ def body_is(name: str) -> Check:
 # Words.
 
 
-def reason(pattern: str) -> Check:
-    """The first reason matches."""
+def reason(name: str, pattern: str = "") -> Check:
+    """The first reason has this identifier, and its text matches."""
 
     def check(run: Run) -> None:
-        assert run.result.reasons and re.search(pattern, run.result.reasons[0]), run.result.reasons
+        assert names(run.result.reasons)[:1] == [name] and re.search(pattern, run.result.reasons[0]), run.result.reasons
 
     return check
 
@@ -223,23 +224,25 @@ def has_no_reason(run: Run) -> None:
     assert run.result.reasons == ()
 
 
-def warns(*patterns: str) -> Check:
+def warns(name: str, times: int = 1) -> Check:
+    """So many warnings have this identifier."""
+
     def check(run: Run) -> None:
-        assert all(any(re.search(p, w) for w in run.result.warnings) for p in patterns), run.result.warnings
+        assert names(run.result.warnings).count(name) == times, run.result.warnings
 
     return check
 
 
-def notes(pattern: str) -> Check:
+def notes(name: str) -> Check:
     def check(run: Run) -> None:
-        assert any(re.search(pattern, note) for note in run.result.notes), run.result.notes
+        assert name in names(run.result.notes), run.result.notes
 
     return check
 
 
-def is_silent_on(pattern: str) -> Check:
+def is_silent_on(name: str) -> Check:
     def check(run: Run) -> None:
-        assert not [w for w in (*run.result.warnings, *run.result.notes) if re.search(pattern, w)]
+        assert name not in names((*run.result.warnings, *run.result.notes))
 
     return check
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from tests.consistency.recordings import mocap, reporting, without_imu
+from tests.remarks import names
 from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
@@ -97,7 +98,7 @@ def test_what_is_merely_wrong_is_estimated_with_it(robot, solved, times, named):
     rig = with_value(rig, "baseline", times * truth.wheels[0].baseline.value)
     result = calibrate_measurements(rig, measurements)
     assert solved[0].wheels[0].baseline.mode == "fixed"
-    assert any("contradicts the data" in w for w in result.warnings) == named
+    assert ("fixed_value_contradicted" in names(result.warnings)) == named
 
 
 def test_a_prior_that_is_far_off_gives_way(robot):
@@ -105,6 +106,6 @@ def test_a_prior_that_is_far_off_gives_way(robot):
     rig, measurements, truth = measured(*drive(robot, "cw"))
     true = not_none(truth.wheels[0].radii.value)
     result = calibrate_measurements(with_value(rig, "radii", 10.0 * true, 1e-3), measurements)
-    (words,) = [w for w in result.warnings if "the prior of radii" in w]
+    (words,) = [w for w in result.warnings if w.name == "prior_contradicted" and "radii" in w]
     shown = float(words.split("alone show ")[1].split(" +- ")[0])
     assert result.converged and min(abs(shown - 1e3 * r) for r in not_none(true)) < 2.0

@@ -52,7 +52,7 @@ def worst(result: Calibration, truth: Camera) -> float:
 
 
 def noted(result: Calibration) -> list[str]:
-    return [w for w in result.notes if w.startswith("the guess of ")]
+    return [w for w in result.notes if w.name == "guess_contradicted"]
 
 
 def wrong_guesses(camera: Camera) -> dict[str, tuple[dict[str, np.ndarray], str]]:

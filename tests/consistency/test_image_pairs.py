@@ -35,7 +35,7 @@ def test_pairs_that_were_not_exposed_together_are_left_out_and_told(late: tuple[
     result = calibrate_measurements(
         rig, Measurements.of_streams(some_images(first, chosen), some_images(second, other))
     )
-    told = [n for n in result.notes if "not exposed together" in n]
+    told = [n for n in result.notes if n.name == "images_not_simultaneous"]
     assert len(told) == (1 if late else 0)
     for k in late:
         assert f"cam0_{k}.png" in told[0] or f"cam1_{k}.png" in told[0]

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 from tests.consistency.cases import Run, known
 from tests.consistency.recordings import mocap, without_imu
+from tests.remarks import names
 
+from icalib.base.remark import Remark
 from icalib.data.measurements import Measurements, WheelStream
 from icalib.errors import EstimationError
 from icalib.pipeline import calibrate_measurements
@@ -29,8 +31,8 @@ def level(**others) -> SimPoses:
     return replace(mocap(**others), T_world_frame=LEVEL)
 
 
-def said(result: Calibration) -> tuple[list[str], list[str]]:
-    notes, warnings = ([w for w in words if "which way is up" in w] for words in (result.notes, result.warnings))
+def said(result: Calibration) -> tuple[list[Remark], list[Remark]]:
+    notes, warnings = ([w for w in some if w.name.startswith("vertical_")] for some in (result.notes, result.warnings))
     return notes, warnings
 
 
@@ -45,11 +47,8 @@ def test_a_level_frame_tells_swapped_wheels(robot):
         calibrate_measurements(rig, swapped(measurements))
     tilting = rig.with_(poses=(replace(rig.poses[0], level=False),))
     notes, warnings = said(calibrate_measurements(tilting, swapped(measurements)))
-    assert notes == [] and len(warnings) == 1
-    words = " ".join(warnings)
-    assert (
-        "-1.00) in the axes of mocap0; if that is down, " in words and "its left and right wheels are swapped" in words
-    )
+    assert notes == [] and names(warnings) == ["vertical_unknown_for_poses"]
+    assert "-1.00) in the axes of mocap0" in warnings[0] and "left and right wheels" in warnings[0]
 
 
 @pytest.mark.full
@@ -67,6 +66,7 @@ def test_with_a_camera_both_readings_are_said(robot):
     """Of a camera that stands upright in a note."""
     rig, measurements, _ = without_imu(robot("ramp", 20.0, "cw"))
     notes, warnings = said(calibrate_measurements(rig, measurements))
-    assert warnings == [] and "nothing but cam0, which then stands upright" in notes[0]
+    assert warnings == [] and names(notes) == ["vertical_from_camera"] and "cam0" in notes[0]
     notes, warnings = said(calibrate_measurements(rig, swapped(measurements)))
-    assert notes == [] and "Either cam0 stands upside down, or its left and right wheels are swapped" in warnings[0]
+    assert notes == [] and names(warnings) == ["vertical_ambiguous"]
+    assert "cam0 stands upside down, or its left and right wheels are swapped" in warnings[0]

@@ -75,7 +75,7 @@ def test_a_wrong_guess_is_replaced(simulation, kind, what):
             true = group(sensor, g.name)
             off = so3.log(np.ascontiguousarray(true.T @ g.value)) if g.name == "rotation" else g.value - true
             assert np.abs(off / g.std).max() < 5.0, g.name
-    noted = [w for w in result.notes if w.startswith("the guess of ")]
+    noted = [w for w in result.notes if w.name == "guess_contradicted"]
     assert all(f" of {sensor.name}" in w for w in noted)
     assert noted or (kind, what) == ("wheels", "inverse")  # the turn of the wheels is nearly its own inverse
 

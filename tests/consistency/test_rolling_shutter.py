@@ -33,6 +33,6 @@ def test_it_is_named_where_it_is(readout_s, named):
     simulation = by_hand(6.0, 3)
     rig = rig_for(simulation.scenario, intrinsics="free", distortion="free")
     result = calibrate_measurements(rig, _rolled(simulation, "cam0", readout_s))
-    said = [reason for reason in result.reasons if "rolling shutter" in reason]
+    said = [reason for reason in result.reasons if reason.name == "rolling_shutter"]
     assert [reason.split()[0] for reason in said] == (["cam0"] if named else [])
     assert not named or result.reasons[0] == said[0]

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.remarks import names
 from tests.typed import not_none
 
 from icalib.geometry import so3
@@ -29,7 +30,7 @@ def driven(robot) -> Simulation:
 
 
 def said(result: Calibration) -> list[str]:
-    return [w for w in result.warnings if "contradicts the data" in w]
+    return [w for w in result.warnings if w.name in ("fixed_value_contradicted", "prior_contradicted")]
 
 
 def stated(rig: Rig, name: str, value: np.ndarray, sigma: float | None = None) -> Rig:
@@ -113,11 +114,11 @@ def test_wheels_that_no_vehicle_has_are_named(driven):
     """Their rates are in rpm, and nothing in the rig file says otherwise."""
     fast = tuple(replace(s, rate=s.rate * 30.0 / np.pi) for s in driven.measurements.wheels)
     result = calibrate_measurements(rig_for(driven.scenario), driven.measurements.with_streams(*fast))
-    words = [w for w in result.warnings if "which no vehicle has" in w]
+    words = [w for w in result.warnings if w.name == "wheel_sizes_implausible"]
     assert len(words) == 1 and "a radius of 10.6 mm and 420" in words[0] and "rate_unit" in words[0], words
 
 
 def test_a_wrong_size_of_the_target_does_not_blame_true_lever_arms(simulation):
     rig = rig_for(simulation.scenario, rotation="fixed", translation="fixed", time_offset="fixed")
     result = calibrate_measurements(replace(rig, target=AprilGrid(6, 6, 1.08 * 0.088, 0.3)), simulation.measurements)
-    assert said(result) == [] and "times the size that the rig file says" in result.wrong[0]
+    assert said(result) == [] and names(result.wrong)[:1] == ["target_size_wrong"]

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.remarks import names
 from tests.typed import instance
 
+from icalib.base.remark import Remark
 from icalib.estimate.score_test import TargetSize, target_size
 from icalib.geometry.targets import AprilGrid, Markers
 from icalib.initialize.rig_guess import guess_of_rig
 from icalib.observability.determination import determine
 from icalib.pipeline import calibrate_measurements
+from icalib.result import Calibration
 from icalib.rig import Parameter, Rig
 from icalib.tools.simulation import handheld, rig_for, simulate, tag_map
 
@@ -89,18 +93,20 @@ def test_over_many_recordings_it_is_off_by_what_is_said(said):
     assert chi2.ppf(0.025, len(z)) < z @ z < chi2.ppf(0.975, len(z))
 
 
-def sentences(said: float, **changes) -> tuple[str, str]:
+def remarks(said: float, **changes) -> tuple[Remark, ...]:
     """Warnings and notes on the size."""
     scenario = replace(handheld(SECONDS), **changes)
     result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
-    return tuple(" ".join(s for s in of if "the target is" in s) for of in (result.warnings, result.notes))  # type: ignore[return-value]
+    return on_the_size(result)
+
+
+def on_the_size(result: Calibration) -> tuple[Remark, ...]:
+    return tuple(r for r in (*result.warnings, *result.notes) if r.name.startswith("target_size_"))
 
 
 def test_a_print_that_was_fitted_to_the_page_is_a_warning():
-    warnings, notes = sentences(0.95)
-    assert "by the accelerometer the target is 1.05" in warnings
-    assert "correct its size" in warnings
-    assert not notes
+    (warning,) = remarks(0.95)
+    assert warning.name == "target_size_wrong" and "the target is 1.05" in warning
 
 
 @pytest.mark.parametrize(("said", "certain"), [(0.9, True), pytest.param(0.97, False, marks=pytest.mark.full)])
@@ -108,14 +114,13 @@ def test_what_no_accelerometer_could_be_is_wrong(said, certain):
     """Accelerometers are off by 3 % at most."""
     scenario = handheld(SECONDS)
     result = calibrate_measurements(of_size(rig_for(scenario), said), simulate(scenario, 0).measurements)
-    assert "by the accelerometer the target is" in result.warnings[0]
+    assert names(result.warnings)[:1] == ["target_size_wrong"]
     assert result.wrong == (result.warnings[:1] if certain else ())
 
 
 def test_the_right_size_is_a_note():
-    warnings, notes = sentences(1.0)
-    assert not warnings
-    assert "by the accelerometer the target is 1.000" in notes or "by the accelerometer the target is 0.999" in notes
+    (note,) = remarks(1.0)
+    assert note.name == "target_size_by_accelerometer" and re.search("the target is (1.000|0.999)", note)
 
 
 def test_a_recording_that_does_not_show_it_says_nothing():
@@ -128,4 +133,4 @@ def test_a_recording_that_does_not_show_it_says_nothing():
         known = {"rotation": Parameter("fixed", T[:3, :3]), "time_offset": Parameter("fixed", np.array([offset]))}
         cameras.append(replace(c, translation=Parameter("free", T[:3, 3]), **known))
     result = calibrate_measurements(rig.with_(cameras=tuple(cameras)), simulation.measurements)
-    assert not [s for s in (*result.warnings, *result.notes) if "the target is" in s]
+    assert on_the_size(result) == ()
