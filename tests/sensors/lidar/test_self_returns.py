@@ -88,7 +88,7 @@ def test_what_is_said_and_what_stays(robot):
     recording = replace(Measurements.of_streams(r.sim.measurements.imu, stream), warnings=(remark("before."),))
     found = without_self_returns(recording)
     before, (said,) = found.warnings[0], found.warnings[1:]
-    assert before == "before." and said.startswith("lidar0 has self-returns: ") and said.endswith(".")
+    assert before == "before." and said.name == "self_returns_removed" and said.startswith("lidar0 ")
     assert "% of its points" in said and "0.86 to 1.3" in said and "azimuth -0 deg" not in said
     assert "azimuth 0 deg" in said and "set min_range of lidar0 to 1.5 in the rig file" in said
     (kept,) = found.lidars

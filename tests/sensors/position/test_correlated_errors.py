@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.remarks import named, names
 from tests.sensors.position.test_position_runs import antenna, errors, recorded
 
 from icalib.optim.state import State, make_layout
@@ -76,8 +77,7 @@ def walking(seed, density, known=WALK, **fields):
 
 def advised(result):
     """The density that a warning on correlated residuals advises."""
-    (warning,) = (w for w in result.warnings if "correlated" in w)
-    assert "the cause is unknown" in warning and "multipath" not in warning
+    warning = named("position_errors_correlated", result.warnings)
     (density,) = re.findall(r"position_random_walk: ([0-9.]+[0-9])", warning)
     return float(density)
 
@@ -99,7 +99,7 @@ def test_a_slow_offset_that_is_not_modelled_is_named():
     assert advised(result) == pytest.approx(WALK, rel=0.4)
     error, std, _, result = walking(2, WALK)
     assert (np.abs(error) < 3.5 * std).all()
-    assert not any("correlated" in w for w in result.warnings)
+    assert "position_errors_correlated" not in names(result.warnings)
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_bursts_of_wrong_fixes_are_rejected(seed):
     error, std, _, result = walking(seed, 0.0, 0.0, bursts=0.2)
     assert (np.abs(error) < 4.0 * std).all()
     assert std[:3].max() < 0.015
-    assert any("outliers" in note for note in result.notes)
+    assert "outliers" in named("position_noise_used", result.notes)
 
 
 @pytest.mark.full
