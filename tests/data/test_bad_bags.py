@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 from tests.cases import each
+from tests.remarks import named, names
 from tests.typed import instance
 
 from icalib.data.bags import Ros1Storage
@@ -71,7 +72,7 @@ class TestCutOff:
 
     def check_beginning(self, recording: Recording, truth) -> int:
         """All that is read is what was written, from the beginning; returns how many messages."""
-        assert any("is truncated or damaged" in note for note in recording.notes())
+        assert "bag_truncated" in names(recording.notes())
         images = readings = 0
         kinds = {t.kind for t in recording.topics() if t.count}
         if any(t.name.startswith("/cam0") and t.count for t in recording.topics()):
@@ -200,7 +201,7 @@ class TestDamaged:
         recording = open_recording(path)
         stamps = instance(imu_readings(recording, IMU), ImuStream).stamps_ns.tolist()
         assert set(stamps) < set(truth.imu_stamps) and len(stamps) > 90 and stamps[-1] == truth.imu_stamps[-1]
-        assert "is damaged; the messages after the damage were ignored" in recording.notes()[0]
+        assert "bag_block_damaged" in names(recording.notes())
 
     def test_a_message_that_is_none(self, tmp_path, write):
         maker = write.maker()
@@ -314,7 +315,7 @@ class TestClocks:
         assert instance(imu_readings(bag, IMU), ImuStream).stamps_ns.tolist() == [
             9 * S + k * 5_000_000 for k in range(20)
         ]
-        assert "/imu: 20 messages have no stamp in their header. Their receive times are used instead" in bag.notes()[0]
+        assert "/imu: 20 " in named("messages_without_stamp", bag.notes())
 
     def test_readings_that_overtook_each_other_are_sorted(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(20)]
@@ -325,7 +326,7 @@ class TestClocks:
         rng = np.random.default_rng(0)
         written = np.array([[rng.normal(size=3), rng.normal(size=3)] for _ in stamps])[:, 0]
         np.testing.assert_array_equal(imu.gyro, written[np.argsort(stamps)])
-        assert "2 readings are out of order by up to 10.0 ms; all were sorted by stamp" in bag.notes()[0]
+        assert " by up to 10.0 ms" in named("readings_out_of_order", bag.notes())
 
     def test_clock_that_was_set_back_is_refused(self, tmp_path, write):
         stamps = [S + k * 5_000_000 for k in range(10)] + [5 + k * 5_000_000 for k in range(10)]

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from tests.cases import each
+from tests.remarks import named
 
 from icalib.data.recordings import decode, open_recording
 from icalib.errors import RecordingError
@@ -109,7 +110,7 @@ def test_a_table_of_another_name_is_found_by_its_number_of_rows(tmp_path):
     (tmp_path / "frames.csv").write_text("time_ns\n" + "\n".join(map(str, stamps.tolist())))
     recording = open_recording(tmp_path)
     assert [p.stamp_ns for p in recording.payloads("cam0.mp4")] == stamps.tolist()
-    assert any("its frames have the stamps of frames.csv" in note for note in recording.notes())
+    assert "frames.csv" in named("video_stamps_from_table", recording.notes())
     assert set(recording.files()) == {tmp_path / "cam0.mp4", tmp_path / "frames.csv"}
     times(tmp_path / "again.csv", FRAMES)
     with pytest.raises(RecordingError, match=r"again\.csv and frames\.csv both .* rename the right one to"):
