@@ -10,6 +10,7 @@ import pytest
 from tests.cases import each
 from tests.remarks import named, names
 
+from icalib.base.remark import Remark
 from icalib.cli import main
 from icalib.data.measurements import LidarStream
 from icalib.data.recordings import FolderRecording, open_recording, read_measurements
@@ -29,7 +30,7 @@ GOOD: dict[str, Any] = {
 }
 
 
-def read(tmp_path, arrays: dict[str, Any]) -> tuple[LidarStream, tuple[str, ...]]:
+def read(tmp_path, arrays: dict[str, Any]) -> tuple[LidarStream, tuple[Remark, ...]]:
     (tmp_path / "lidar0").mkdir(exist_ok=True)
     np.savez(tmp_path / "lidar0" / "scans.npz", **arrays)
     folder = FolderRecording(tmp_path)
