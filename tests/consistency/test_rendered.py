@@ -104,9 +104,7 @@ def test_what_the_lens_bends_within_a_window_is_all_that_distortion_is_off(
     assert abs(result.group("cam0", "bloom").value[0]) < 0.005
 
 
-@pytest.mark.parametrize(
-    "form", ["mcap", *(pytest.param(f, marks=pytest.mark.full) for f in FORMS if f not in ("ros1", "mcap"))]
-)
+@pytest.mark.parametrize("form", [pytest.param(f, marks=pytest.mark.full) for f in FORMS if f != "ros1"])
 def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form, Path], result: Calibration):
     other = icalib.calibrate(rig, recordings[form])
     for ours, theirs in zip(result.groups, other.groups, strict=True):
@@ -123,7 +121,7 @@ def test_every_format_gives_the_same(form: Form, rig: Rig, recordings: dict[Form
     "target",
     [
         pytest.param(Charuco(8, 6, 0.08, 0.06, "4x4_50"), id="charuco", marks=pytest.mark.full),
-        pytest.param(Checkerboard(6, 9, 0.06), id="checkerboard"),
+        pytest.param(Checkerboard(6, 9, 0.06), id="checkerboard", marks=pytest.mark.full),
     ],
 )
 def test_other_targets_and_an_exposure(target: Target, scenario: Scenario, tmp_path: Path):
