@@ -164,10 +164,7 @@ def test_too_few_surfaces_with_a_guess(drive, faces: list[int]):
 
 @pytest.mark.parametrize(
     ("faces", "known"),
-    [
-        ([0, 2, 3], True),
-        *(pytest.param(f, k, marks=pytest.mark.full) for f, k in (([0, 2], True), ([0, 2], False), ([0, 2, 3], False))),
-    ],
+    [pytest.param(f, k, marks=pytest.mark.full) for f in ([0, 2, 3], [0, 2]) for k in (True, False)],
 )
 def test_a_corridor_is_told(drive, faces: list[int], known: bool):
     """One or two walls and a floor leave the motion along them open. Whether the IMU carries the solver through is a
