@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
@@ -20,6 +21,7 @@ from icalib.tools.simulation.scenario import (
     BagEvent,
     BagTopic,
     Report,
+    SimRecord,
     SimScene,
     SimSensor,
     at_least,
@@ -98,17 +100,19 @@ class SimLidar(SimSensor):
         near, far = self.range_m
         return Lidar(self.name, f"{self.name}/scans.npz", self.range_noise_m, min_range_m=near, max_range_m=far)
 
-    def write_table(self, folder: Path, stream: LidarStream) -> None:
-        folder.mkdir(parents=True, exist_ok=True)
-        arrays = {name: getattr(stream, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
-        np.savez(folder / "scans.npz", **arrays)
-
-    def bag_topic(self, stream: LidarStream, offset_ns: int) -> BagTopic:
-        """PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""
-        return BagTopic(f"/{self.name}/points", _CLOUD_MESSAGE, _clouds(stream, offset_ns))
+    def record(self, stream: LidarStream, offset_ns: int) -> SimRecord:
+        """Arrays, and PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""
+        topic = BagTopic(f"/{self.name}/points", _CLOUD_MESSAGE, _clouds(stream, offset_ns))
+        return SimRecord(partial(_write_scans, stream), topic)
 
 
 SIMULATED = SimLidar
+
+
+def _write_scans(stream: LidarStream, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    arrays = {name: getattr(stream, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
+    np.savez(folder / "scans.npz", **arrays)
 
 
 def _clouds(lidar: LidarStream, offset_ns: int) -> Iterator[BagEvent]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -18,8 +19,10 @@ from icalib.tools.simulation.scenario import (
     BagEvent,
     BagTopic,
     Report,
+    SimRecord,
     SimScene,
     SimSensor,
+    TrueParameters,
     at_least,
     mounted_fields,
     pose,
@@ -70,11 +73,9 @@ class SimPoses(SimSensor):
             chosen["T_world_frame"] = pose(fields["T_world_frame"])
         return cls(name, **common, **chosen)
 
-    def values(self) -> dict[str, np.ndarray]:
-        return {"scale": np.array([self.scale])}
-
-    def plain(self) -> dict[str, Any]:
-        return {"kind": self.kind, "T_world_frame": self.T_world_frame.tolist(), "scale": self.scale}
+    def true_parameters(self) -> TrueParameters:
+        entries = {"kind": self.kind, "T_world_frame": self.T_world_frame.tolist()}
+        return TrueParameters({"scale": np.array([self.scale])}, entries)
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
         """Poses while the IMU is running, with noise if the scene is noisy; and the poses without noise."""
@@ -95,17 +96,19 @@ class SimPoses(SimSensor):
         noise = self.rotation_noise, self.position_noise
         return PoseSensor(self.name, f"{self.name}/poses.csv", self.kind, *noise, scale_sigma=0.0)
 
-    def write_table(self, folder: Path, stream: PoseStream) -> None:
-        header = "t [ns],x [m],y [m],z [m],qx,qy,qz,qw"
-        xyzw = np.array([quaternion(R) for R in stream.rotation])
-        write_table(folder / "poses.csv", header, stream.stamps_ns, stream.position, xyzw)
-
-    def bag_topic(self, stream: PoseStream, offset_ns: int) -> BagTopic:
-        """Messages PoseStamped."""
-        return BagTopic(f"/{self.name}/pose", _POSE_MESSAGE, _messages(stream, offset_ns))
+    def record(self, stream: PoseStream, offset_ns: int) -> SimRecord:
+        """A table, and messages PoseStamped."""
+        topic = BagTopic(f"/{self.name}/pose", _POSE_MESSAGE, _messages(stream, offset_ns))
+        return SimRecord(partial(_write_poses, stream), topic)
 
 
 SIMULATED = SimPoses
+
+
+def _write_poses(stream: PoseStream, folder: Path) -> None:
+    header = "t [ns],x [m],y [m],z [m],qx,qy,qz,qw"
+    xyzw = np.array([quaternion(R) for R in stream.rotation])
+    write_table(folder / "poses.csv", header, stream.stamps_ns, stream.position, xyzw)
 
 
 def _messages(poses: PoseStream, offset_ns: int) -> Iterator[BagEvent]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,8 +18,10 @@ from icalib.tools.simulation.scenario import (
     BagEvent,
     BagTopic,
     Report,
+    SimRecord,
     SimScene,
     SimSensor,
+    TrueParameters,
     at_least,
     mounted_fields,
     pose,
@@ -83,8 +86,8 @@ class SimPositions(SimSensor):
             chosen["shared_frame"] = fields["shared_frame"].text()
         return cls(name, **common, **chosen)
 
-    def plain(self) -> dict[str, Any]:
-        return {"T_world_frame": self.T_world_frame.tolist()}
+    def true_parameters(self) -> TrueParameters:
+        return TrueParameters(entries={"T_world_frame": self.T_world_frame.tolist()})
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
         """Fixes within the span of the IMU's readings, noisy if the scene is, and their true values."""
@@ -138,15 +141,17 @@ class SimPositions(SimSensor):
             position_noise=self.position_noise if plain and self.position_noise > 0.0 else None,
         )
 
-    def write_table(self, folder: Path, stream: PositionStream) -> None:
-        write_table(folder / "positions.csv", "t [ns],x [m],y [m],z [m]", stream.stamps_ns, stream.position)
-
-    def bag_topic(self, stream: PositionStream, offset_ns: int) -> BagTopic:
-        """The fixes as PointStamped messages, received `offset_ns` after their stamps."""
-        return BagTopic(f"/{self.name}/position", _POINT, _messages(stream, offset_ns))
+    def record(self, stream: PositionStream, offset_ns: int) -> SimRecord:
+        """A table, and the fixes as PointStamped messages, received `offset_ns` after their stamps."""
+        topic = BagTopic(f"/{self.name}/position", _POINT, _messages(stream, offset_ns))
+        return SimRecord(partial(_write_fixes, stream), topic)
 
 
 SIMULATED = SimPositions
+
+
+def _write_fixes(stream: PositionStream, folder: Path) -> None:
+    write_table(folder / "positions.csv", "t [ns],x [m],y [m],z [m]", stream.stamps_ns, stream.position)
 
 
 def _messages(stream: PositionStream, offset_ns: int) -> Iterator[BagEvent]:

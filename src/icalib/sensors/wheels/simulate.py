@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -16,7 +17,17 @@ from icalib.errors import RigError
 from icalib.sensors.wheels.spec import WheelKind, Wheels, drive_names
 from icalib.tools.simulation.output import BagWriter, write_table
 from icalib.tools.simulation.room import Room
-from icalib.tools.simulation.scenario import BagEvent, BagTopic, Report, SimScene, SimSensor, at_least, mounted_fields
+from icalib.tools.simulation.scenario import (
+    BagEvent,
+    BagTopic,
+    Report,
+    SimRecord,
+    SimScene,
+    SimSensor,
+    TrueParameters,
+    at_least,
+    mounted_fields,
+)
 from icalib.tools.simulation.trajectory import LEAD_S, Drive, TrueTrajectory, check_enough, stamped
 
 _GAUSS = np.polynomial.legendre.leggauss(3)  # points and weights on [-1, 1]
@@ -107,21 +118,9 @@ class SimWheels(SimSensor):
                 "poses, or choose a motion on the ground."
             )
 
-    def values(self) -> dict[str, np.ndarray]:
-        return {name: np.atleast_1d(np.array(getattr(self, name))) for name in drive_names(_KINDS[self.reports])}
-
-    def drawn_values(self, rng: np.random.Generator, relative_error: float) -> dict[str, np.ndarray]:
-        """True values with random errors: relative_error times the value for lengths and scales, times 1 rad for an
-        angle."""
-        drawn, off = {}, relative_error * rng.standard_normal(3)
-        positive = {spec.name for spec in Wheels.parameters if spec.is_positive}
-        for name, value in self.values().items():
-            errors, off = off[: value.size], off[value.size :]
-            drawn[name] = value + errors * (value if name in positive else 1.0)
-        return drawn
-
-    def plain(self) -> dict[str, Any]:
-        return {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in self.values().items()}
+    def true_parameters(self) -> TrueParameters:
+        names = drive_names(_KINDS[self.reports])
+        return TrueParameters({name: np.atleast_1d(np.array(getattr(self, name))) for name in names})
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
         """The simulated stream within the time of the IMU, and its truth. Raises RigError if there are too few
@@ -162,26 +161,29 @@ class SimWheels(SimSensor):
             vertical_slip=slip,
         )
 
-    def write_table(self, folder: Path, stream: WheelStream | WheelPoses) -> None:
-        if isinstance(stream, WheelStream):
-            name, columns = _COLUMNS[stream.kind]
-            header = f"t [ns],{columns}; {_SAMPLING[stream.sampling]}"
-            write_table(folder / f"{name}.csv", header, stream.stamps_ns, stream.rate)
-            return
-        header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
-        stamps, upper = stream.stamps_ns, stream.covariance[:, *np.triu_indices(3)]
-        write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], stream.pose, upper)
-
-    def bag_topic(self, stream: WheelStream | WheelPoses, offset_ns: int) -> BagTopic | str:
-        """Topic with JointState or TwistStamped messages; for relative poses a sentence, as they have no message."""
+    def record(self, stream: WheelStream | WheelPoses, offset_ns: int) -> SimRecord:
+        """A table, and JointState or TwistStamped messages. Relative poses have no message."""
         if isinstance(stream, WheelPoses):
-            return f"{self.name} reports relative poses, which no driver sends; they are not written."
-        if stream.kind == "twist":
-            return BagTopic(f"/{self.name}/twist", _TWIST, _twists(stream, offset_ns))
-        return BagTopic(f"/{self.name}/joint_states", _JOINT_STATE, _joint_states(stream, offset_ns))
+            topic = f"{self.name} reports relative poses, which no driver sends; they are not written."
+        elif stream.kind == "twist":
+            topic = BagTopic(f"/{self.name}/twist", _TWIST, _twists(stream, offset_ns))
+        else:
+            topic = BagTopic(f"/{self.name}/joint_states", _JOINT_STATE, _joint_states(stream, offset_ns))
+        return SimRecord(partial(_write_table, stream), topic)
 
 
 SIMULATED = SimWheels
+
+
+def _write_table(stream: WheelStream | WheelPoses, folder: Path) -> None:
+    if isinstance(stream, WheelStream):
+        name, columns = _COLUMNS[stream.kind]
+        header = f"t [ns],{columns}; {_SAMPLING[stream.sampling]}"
+        write_table(folder / f"{name}.csv", header, stream.stamps_ns, stream.rate)
+        return
+    header = "from [ns],to [ns],yaw [rad],x [m],y [m],covariance: yaw yaw,yaw x,yaw y,x x,x y,y y"
+    stamps, upper = stream.stamps_ns, stream.covariance[:, *np.triu_indices(3)]
+    write_table(folder / "poses.csv", header, stamps[:-1], stamps[1:], stream.pose, upper)
 
 
 def _number(key: str, value: YamlValue) -> Any:

@@ -139,7 +139,7 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
 def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, np.ndarray]:
     """True parameters of a sensor by their names in the rig, extrinsics and time offset included."""
     T, offset = sensor.T_imu_sensor, np.array([raw_time_offset(scenario, sensor)])
-    return mounted(T[:3, :3], T[:3, 3], offset) | sensor.values()
+    return {**mounted(T[:3, :3], T[:3, 3], offset), **sensor.true_parameters().values}
 
 
 def _motion(scenario: Scenario, seed: int) -> TrueTrajectory:

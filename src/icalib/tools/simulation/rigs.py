@@ -15,11 +15,12 @@ from icalib.rig.file import rig_to_dict
 from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.motion import rotation_from_vector
 from icalib.tools.simulation.recording import raw_time_offset, true_values
-from icalib.tools.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera
+from icalib.tools.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera, SimSensor
 
 Treatment = Literal["free", "start", "fixed"] | Parameter
 _HEADER = "# Rig file of a simulated recording: sensors, noise and target, without any value that is estimated.\n"
 _GUESS_STREAM = 3000  # number of the random stream of guesses; `simulate` has the others
+_MOST_DRAWN = 3  # numbers are drawn for all types of wheels, so that those of other sensors do not depend on it
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,8 @@ def with_drawn_guess(
     def guessed(sensor: Sensor) -> Sensor:
         sim = sims[sensor.name]
         drawn = _drawn_pose(sim.T_imu_sensor, raw_time_offset(scenario, sim), rng, spread)
-        drawn |= _drawn_lens(sim, rng, spread) if isinstance(sim, SimCamera) else sim.drawn_values(rng, spread.relative)
+        is_camera = isinstance(sim, SimCamera)
+        drawn |= _drawn_lens(sim, rng, spread) if is_camera else _drawn_values(sensor, sim, rng, spread)
         names = [spec.name for spec in sensor.stated() if spec.name in drawn and (only is None or spec.name in only)]
         free = [name for name in names if getattr(sensor, name).mode == "free"]
         return replace(sensor, **{name: Parameter("free", drawn[name]) for name in free})
@@ -139,6 +141,18 @@ def with_drawn_guess(
 def _drawn_lens(sim: SimCamera, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
     focal = np.array(sim.intrinsics[:2]) * (1.0 + error.relative * rng.standard_normal())
     return {"intrinsics": np.array([*focal, *(0.5 * (side - 1) for side in sim.resolution)])}
+
+
+def _drawn_values(sensor: Sensor, sim: SimSensor, rng: np.random.Generator, error: GuessError) -> dict[str, np.ndarray]:
+    """The true values that the rig file may state, with random errors: relative to the value for lengths and scales, of
+    1 rad for an angle."""
+    true, drawn = sim.true_parameters().values, dict[str, np.ndarray]()
+    specs = [spec for spec in sensor.stated() if spec.name in true]
+    off = error.relative * rng.standard_normal(_MOST_DRAWN if specs else 0)
+    for spec in specs:
+        (errors, off), value = (off[: spec.size], off[spec.size :]), true[spec.name]
+        drawn[spec.name] = value + errors * (value if spec.is_positive else 1.0)
+    return drawn
 
 
 def _drawn_pose(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import ceil
 from pathlib import Path
@@ -57,6 +57,24 @@ class BagTopic:
 
 
 @dataclass(frozen=True, eq=False)
+class SimRecord:
+    """How measurements are recorded. write_table: writes them to the sensor's folder, as a table with the path in
+    `SimSensor.rig_entry`; topic: the messages that the sensor's driver would send, or a sentence if it has none."""
+
+    write_table: Callable[[Path], None]
+    topic: BagTopic | str
+
+
+@dataclass(frozen=True, eq=False)
+class TrueParameters:
+    """values: by their names in the rig, except extrinsics and time offset; entries: what else truth.yaml says of the
+    sensor, but for its type."""
+
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+    entries: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
 class SimSensor(ABC):
     """A simulated sensor that is rigidly mounted to the IMU and has a separate clock.
 
@@ -96,18 +114,8 @@ class SimSensor(ABC):
         """Number of points of one measurement; 0 for a sensor without points."""
         return 0
 
-    def values(self) -> dict[str, np.ndarray]:
-        """True values of its parameters by their names in the rig, except extrinsics and time offset."""
-        return {}
-
-    def drawn_values(self, rng: np.random.Generator, relative_error: float) -> dict[str, np.ndarray]:
-        """Initial guesses of `values`, drawn about the truth; relative_error: standard deviation relative to the
-        value."""
-        return {}
-
-    def plain(self) -> dict[str, Any]:
-        """The sensor's entries in truth.yaml, except type, extrinsics and time offset."""
-        return {}
+    def true_parameters(self) -> TrueParameters:
+        return TrueParameters()
 
     @abstractmethod
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
@@ -119,13 +127,9 @@ class SimSensor(ABC):
         """The sensor as a user would write it in the rig, with the simulated noise and without known parameters."""
 
     @abstractmethod
-    def write_table(self, folder: Path, stream: Any) -> None:
-        """Writes the measurements to the sensor's folder, as a table with the path in `rig_entry`."""
-
-    @abstractmethod
-    def bag_topic(self, stream: Any, offset_ns: int) -> BagTopic | str:
-        """The messages that the sensor's driver would send, or a sentence if it has none. offset_ns: to be added to the
-        sensor's stamps to get the IMU's clock [ns]."""
+    def record(self, stream: Any, offset_ns: int) -> SimRecord:
+        """Table and messages of its measurements. offset_ns: to be added to the sensor's stamps to get the IMU's clock
+        [ns]."""
 
 
 # Refuses scenarios whose measurements do not fit in memory: the simulator keeps all of them.
@@ -388,13 +392,9 @@ class SimCamera:
                 f"{self.name}: the simulator has no camera model {self.model!r}; available are {', '.join(MODELS)}."
             )
 
-    def values(self) -> dict[str, np.ndarray]:
-        """True values of its parameters by their names in the rig, except extrinsics and time offset."""
-        return {
-            INTRINSICS.name: np.array(self.intrinsics),
-            DISTORTION.name: np.array(self.distortion),
-            BLOOM.name: np.array([self.bloom_px]),
-        }
+    def true_parameters(self) -> TrueParameters:
+        lens = {INTRINSICS.name: np.array(self.intrinsics), DISTORTION.name: np.array(self.distortion)}
+        return TrueParameters({**lens, BLOOM.name: np.array([self.bloom_px])})
 
 
 @dataclass(frozen=True)

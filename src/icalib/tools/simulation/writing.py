@@ -20,7 +20,7 @@ from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagForm, BagWr
 from icalib.tools.simulation.recording import Simulation, Truth
 from icalib.tools.simulation.rendering import Imaging
 from icalib.tools.simulation.rigs import rig_text
-from icalib.tools.simulation.scenario import BagTopic, Scenario
+from icalib.tools.simulation.scenario import BagTopic, Scenario, SimRecord, SimSensor
 
 # Writes films as bags of ROS 1 and ROS 2 by rosbags (extra `bags`), or in EuRoC's layout (extra `images`).
 
@@ -167,7 +167,7 @@ def write_tables(
         steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
         steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]
         for sensor in simulation.scenario.sensors:
-            steps.append(partial(sensor.write_table, below(folder, sensor.name), measured.streams[sensor.name]))
+            steps.append(partial(_record(simulation, sensor).write_table, below(folder, sensor.name)))
         steps += [partial(write_truth, simulation, seed, folder)]
         for i, step in enumerate(steps):
             step()
@@ -199,7 +199,9 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
         parameters = {"intrinsics": list(map(float, c.intrinsics)), "distortion": list(map(float, c.distortion))}
         sensors[c.name] = _mounted(truth, c.name, "camera") | {"model": c.model} | parameters
     for s in scenario.sensors:
-        sensors[s.name] = _mounted(truth, s.name, s.sensor_type) | s.plain()
+        true = s.true_parameters()
+        values = {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in true.values.items()}
+        sensors[s.name] = {**_mounted(truth, s.name, s.sensor_type), **true.entries, **values}
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
         plain |= {"T_world_bodies": truth.T_world_bodies.tolist(), "target_size": truth.target_size}
@@ -243,7 +245,7 @@ def write_sensors(
     """Writes an MCAP bag, its truth and its rig file to the new folder `path`, atomically. If `path` ends with .bag,
     it is a ROS 1 bag, with only the rig file beside it, as `run.rig.yaml`.
 
-    Topics are /imu0 (Imu), those of `SimSensor.bag_topic`, and /NAME/image_raw (Image, mono8), which shows the target,
+    Topics are /imu0 (Imu), those of `SimSensor.record`, and /NAME/image_raw (Image, mono8), which shows the target,
     or the room if there is no target. Returns sentences on data that were left out. Raises RecordingError if `path`
     exists or cannot be written, CalibrationError if a package is missing, RigError for a board that is not flat.
     """
@@ -270,11 +272,11 @@ def write_sensors(
 
 def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[Iterator[Event]], tuple[str, ...]]:
     """The message type of each topic, the events of each stream, and sentences on sensors without messages."""
-    measured, truth = simulation.measurements, simulation.truth
+    measured = simulation.measurements
     assert measured.imu is not None  # of every scenario
     topics, streams, notes = {IMU_TOPIC: IMU}, [_readings(measured.imu)], []
     for sensor in simulation.scenario.sensors:
-        topic = sensor.bag_topic(measured.streams[sensor.name], round(truth.time_offset[sensor.name] * 1e9))
+        topic = _record(simulation, sensor).topic
         if isinstance(topic, str):
             notes.append(topic)
             continue
@@ -286,6 +288,12 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
     elif simulation.scenario.cameras:
         notes.append("images show targets or a room, and the scenario has neither, so no images are written.")
     return topics, streams, tuple(notes)
+
+
+def _record(simulation: Simulation, sensor: SimSensor) -> SimRecord:
+    """Table and messages of a sensor's measurements."""
+    offset_ns = round(simulation.truth.time_offset[sensor.name] * 1e9)
+    return sensor.record(simulation.measurements.streams[sensor.name], offset_ns)
 
 
 def _on_topic(topic: BagTopic) -> Iterator[Event]:
