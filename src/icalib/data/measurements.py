@@ -14,6 +14,7 @@ from icalib.sensors.camera.stream import CornerStream, TrackStream
 from icalib.sensors.imu.stream import ImuStream
 from icalib.sensors.lidar.stream import LidarStream
 from icalib.sensors.pose.stream import PoseStream
+from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.sensor import TIME_OFFSET
 from icalib.sensors.stream import S, Stream
 from icalib.sensors.wheels.stream import WheelPoses, WheelStream
@@ -28,6 +29,7 @@ __all__ = [
     "LidarStream",
     "Measurements",
     "PoseStream",
+    "PositionStream",
     "Stream",
     "TrackStream",
     "WheelPoses",

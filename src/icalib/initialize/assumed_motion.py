@@ -24,6 +24,7 @@ from icalib.estimate.inputs import Inputs, inputs_for
 from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry.targets.base import BOARD
 from icalib.initialize.initializer import (
+    BodyTrajectory,
     InitialGuess,
     Initializer,
     MotionContradictedError,
@@ -35,6 +36,7 @@ from icalib.initialize.initializer import (
     merged_values,
     motion_kinds,
     place_sensors,
+    sources_of,
     stated_values,
 )
 from icalib.initialize.smooth_trajectory import MIN_PARABOLA_POSES, BodyPoses, SmoothTrajectory
@@ -59,13 +61,15 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
     Raises EstimationError if the body's poses do not show its motion, are in another convention, or if other sensors do
     not align to it.
     """
+    source, trajectory = motion_kinds(rig)[0], None
     try:
-        return _guess(rig, recordings)
+        trajectory = source.body_poses(rig, recordings)
+        return _guess(rig, recordings, trajectory)
     except EstimationError as error:
-        rewritten = motion_kinds(rig)[0].rewritten if isinstance(error, MotionContradictedError) else None
-        for words, converted in rewritten(rig, recordings) if rewritten else ():
+        contradicted = trajectory if isinstance(error, MotionContradictedError) else None
+        for words, converted in contradicted.conventions if contradicted else ():
             try:
-                _guess(rig, converted)
+                _guess(rig, converted, source.body_poses(rig, converted))
             except EstimationError:
                 continue
             raise EstimationError(words) from error
@@ -82,15 +86,12 @@ def _with_rate(sentence: str, body: Stream) -> str:
     return sentence.replace(ASSUMED_IMU, f"{body.name} at {rate:.3g} Hz") + advice
 
 
-def _guess(rig: Rig, recordings: Sequence[Measurements]) -> InitialGuess:
-    """As `guess_with_assumed_motion`, without trying other conventions of the poses."""
-    motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings)
+def _guess(rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTrajectory) -> InitialGuess:
+    """As `guess_with_assumed_motion`, without trying other conventions of the poses. trajectory: of the source."""
+    motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings, trajectory)
     for kind in kinds_of(rig):
         if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
             return still
-    for m in recordings:
-        for kind in kinds_of(rig):
-            kind.check_moving(m)
     for poses, m in zip(motion.body, recordings, strict=True):
         if len(poses.seconds) < MIN_PARABOLA_POSES:
             where = f"{m.name}: " if len(recordings) > 1 else ""
@@ -129,13 +130,15 @@ class _BodyMotion:
     odometry: str | None = None
 
     @classmethod
-    def by(cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements]) -> _BodyMotion:
-        """Poses of the body by the sensors of `source`. If the body is of another kind, all sensors that host keyframes
-        are aligned to these first."""
-        paths, values = source.body_poses(rig, recordings)
+    def by(
+        cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTrajectory
+    ) -> _BodyMotion:
+        """Poses of the body from the `trajectory` of `source`. If the body is of another kind, all sensors that host
+        keyframes are aligned to it first."""
+        paths = trajectory.poses
         if initializer_of(rig.sensors[rig.reference]) is source:
-            return cls(paths, values)
-        (name,) = source.sources(rig)
+            return cls(paths, trajectory.values)
+        (name,) = sources_of(source, rig)
         values = _place_on_odometry(rig, recordings, name, paths)
         return cls(body_poses_by(rig, recordings, name, paths, values), relative_to_body(rig, name, values), name)
 

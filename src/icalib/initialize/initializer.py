@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -19,6 +19,7 @@ from icalib.geometry import so3
 from icalib.geometry.targets import NoTarget
 from icalib.initialize.smooth_trajectory import BodyPoses, SmoothTrajectory
 from icalib.kinds import initializers
+from icalib.model.sensor_model import FRAME, frame_of
 from icalib.motion.imu_data import imu_data
 from icalib.optim.state import Key, State
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
@@ -42,16 +43,36 @@ Values = dict[Key, np.ndarray]
 InputsWithMotion = tuple[Inputs, State]  # inputs, and a state whose poses are the trajectory
 InitialGuess = tuple[Inputs, State, Values]  # inputs, start state, values to which unobservable parameters are reset
 
-# Ranks of the kinds that show the motion, the preferred one first: see `Initializer.motion_rank`.
+# Ranks of the kinds that show the motion, the preferred one first: see `MotionSource`.
 BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
 
 
-class Fixes(NamedTuple):
-    """t (n,) s since the first stamp of the sensor, `origin_ns`; z (n,) complex: x + i y of its positions [m]."""
+class MotionSource(NamedTuple):
+    """rank: among the kinds that show the motion, the smallest is preferred; sensors: names of those that show it."""
 
-    t: np.ndarray
-    z: np.ndarray
-    origin_ns: int = 0
+    rank: int
+    sensors: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class BodyTrajectory:
+    """Poses of the body in each recording, without an IMU. values: of the sensors, estimated with them; conventions:
+    recordings with measurements converted from another convention, each with a sentence that names it."""
+
+    poses: list[BodyPoses]
+    values: Values = field(default_factory=dict)
+    conventions: Iterable[tuple[str, list[Measurements]]] = ()
+
+
+@dataclass(frozen=True)
+class FailedEstimate:
+    """Why an estimate failed. converges: whether the estimate of a changed rig converges; None during an attempt, as
+    fallbacks may succeed."""
+
+    rig: Rig
+    recordings: Sequence[Measurements]
+    error: EstimationError
+    converges: Callable[[Rig], bool] | None = None
 
 
 class OtherMotionError(EstimationError):
@@ -76,100 +97,62 @@ class Initializer(Generic[S]):
     refined_alone = True  # whether its trajectory is refined even if no other sensor is aligned to it
     moves_keyframes = False  # whether keyframes are placed again after the refinement, which changes its time offset
 
-    def motion_rank(self, rig: Rig) -> int | None:
-        """Rank of this kind among those that show the motion of `rig`; the smallest is preferred. None if it does not
-        show the motion."""
-        return None
+    def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+        """The recordings without measurements of this kind that must not be used, and with those that had several
+        interpretations resolved to one."""
+        return recordings
 
-    def sources(self, rig: Rig) -> tuple[str, ...]:
-        """Names of the sensors that show the motion; by default all sensors of this kind."""
-        return tuple(s.name for s in rig.mounted if initializer_of(s) is self)
+    def motion_source(self, rig: Rig) -> MotionSource | None:
+        """The sensors of this kind that show the motion of `rig`; None if it does not show the motion."""
+        return None
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         """A state with the trajectory and a guess of the sensors, from their measurements and the IMU's. inputs: of
-        `sources` and the IMU alone. fallback: returns inputs and trajectory by the next kind in rank.
+        `motion_source` and the IMU alone. fallback: returns inputs and trajectory by the next kind in rank.
 
         Raises EstimationError if the sensors do not show the motion.
         """
         raise NotImplementedError
 
-    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        """Refines the result of `trajectory` by a solve, so that other sensors can be aligned to it. Returns inputs,
-        state, and the guess to which unobservable parameters are reset."""
+    def refined(self, inputs: Inputs, source_inputs: Inputs, state: State) -> InitialGuess:
+        """Refines the result of `trajectory` by a solve, so that other sensors can be aligned to it. Returns `inputs`,
+        those of all sensors, with what changed in `source_inputs`, those of `motion_source`; state, and the guess to
+        which unobservable parameters are reset."""
         raise NotImplementedError
-
-    def adopted(self, inputs: Inputs, source_inputs: Inputs) -> Inputs:
-        """`inputs`, the inputs of all sensors, with the changes that `refined` made in `source_inputs`, the inputs of
-        `sources`."""
-        return inputs
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[S]) -> Values:
         """Calibration parameters of `sensors` and of their frames: values of the rig file, or values that align them to
         the trajectory in `state`. Raises EstimationError if neither determines them."""
         return {}
 
-    def associated(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+    def associated(self, inputs: Inputs, state: State) -> InitialGuess:
         """Associates measurements that need the extrinsics of all sensors. `state` has the trajectory and a guess of
         all sensors. Returns inputs, state, and the changed values of the guess."""
         return inputs, state, {}
 
-    def unambiguous(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
-        """The recordings with measurements of this kind that had several interpretations resolved to one."""
-        return recordings
-
-    def cleaned(self, recording: Measurements) -> Measurements:
-        """The recording without measurements that must not be used."""
-        return recording
-
-    def vertical(self, state: State, sensor: S) -> np.ndarray | None:
-        """Unit vector (3,) in the world that points upwards, if the frame of the sensor's measurements is level; else
-        None."""
+    def explained(self, failed: FailedEstimate) -> EstimationError | None:
+        """The error that tells why the estimate failed, if the cause is known; else None."""
         return None
 
     # Without an IMU
 
-    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
-        """Poses of the body in each recording, and values of its sensors that were estimated with them. The body is the
-        reference sensor if it is of this kind, else the first of `sources`. Raises EstimationError if the sensors do
-        not show the poses."""
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
+        """Poses of the body in each recording. The body is the reference sensor if it is of this kind, else the first
+        of `motion_source`. Raises EstimationError if the sensors do not show the poses."""
         raise NotImplementedError
-
-    def fixes(self, recording: Measurements) -> list[Fixes]:
-        """Horizontal positions of points of the body, one item a sensor, if sensors of this kind measure them."""
-        return []
-
-    def check_moving(self, recording: Measurements) -> None:
-        """Raises EstimationError if sensors of this kind measure too rarely to show a motion."""
 
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> InitialGuess | None:
         """The whole initial guess if all measurements were taken at rest, so that no motion is assumed; else None.
-        body_poses, values: results of `body_poses`."""
+        body_poses, values: those of `BodyTrajectory`. Raises EstimationError if sensors of this kind measure too rarely
+        to show a motion."""
         return None
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         """The largest spacing of keyframes [s] at which the error of the assumed motion is small against the noise of
         sensors of this kind."""
         return np.inf
-
-    def rewritten(self, rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        """Versions of the recordings in which measurements of `sources` are converted from another convention, each
-        with a sentence that names the convention. They are tried if other sensors contradict the motion."""
-        return iter(())
-
-    # Errors
-
-    def explaining(self, inputs: Inputs) -> AbstractContextManager[None]:
-        """A context in which errors name the parameters that these sensors do not show, if they give the motion."""
-        return nullcontext()
-
-    def explained(
-        self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
-    ) -> EstimationError | None:
-        """The error that explains why the estimate broke down, if the cause is known; else None. converges: whether the
-        estimate of a changed rig converges."""
-        return None
 
 
 NO_INITIALIZER: Initializer[Sensor] = Initializer()
@@ -188,8 +171,15 @@ def kinds_of(rig: Rig) -> list[Initializer[Any]]:
 
 def motion_kinds(rig: Rig) -> list[Initializer[Any]]:
     """Initializers of the kinds that show the motion of `rig`, by rank, the preferred one first."""
-    ranked = {kind: rank for kind in kinds_of(rig) if (rank := kind.motion_rank(rig)) is not None}
+    ranked = {kind: source.rank for kind in kinds_of(rig) if (source := kind.motion_source(rig)) is not None}
     return sorted(ranked, key=lambda kind: ranked[kind])
+
+
+def sources_of(kind: Initializer[Any], rig: Rig) -> tuple[str, ...]:
+    """Names of the sensors of a kind in `motion_kinds` that show the motion."""
+    source = kind.motion_source(rig)
+    assert source is not None
+    return source.sensors
 
 
 def keyframe_hosts(sensors: Iterable[Sensor]) -> list[Sensor]:
@@ -284,8 +274,8 @@ def _vertical_by_frames(inputs: Inputs, state: State, axis: np.ndarray) -> tuple
     it."""
     in_world = np.einsum("nij,j->i", state.rotation, axis) / len(state.rotation)
     for sensor in inputs.rig.mounted:
-        up = initializer_of(sensor).vertical(state, sensor)
-        if up is not None and abs(along := float(in_world @ up)) > MIN_LEVEL_COSINE:
+        frame = state.values.get((frame_of(sensor.name, 0), FRAME[0])) if sensor.has_level_frame else None
+        if frame is not None and abs(along := float(in_world @ frame[:, 2])) > MIN_LEVEL_COSINE:
             return along, sensor.name
     return 0.0, None
 

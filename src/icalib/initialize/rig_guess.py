@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,6 +19,7 @@ from icalib.estimate.residual_statistics import chi2_by_kind
 from icalib.estimate.solver import Step, Visit
 from icalib.initialize.assumed_motion import ASSUMED_POSES, guess_with_assumed_motion, pose_sensor_for
 from icalib.initialize.initializer import (
+    FailedEstimate,
     FarOffError,
     InitialGuess,
     Initializer,
@@ -32,6 +33,7 @@ from icalib.initialize.initializer import (
     motion_kinds,
     place_sensors,
     refusing_far_off,
+    sources_of,
 )
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
@@ -52,7 +54,7 @@ def guess_of_rig(
     determine a guess.
     """
     for kind in kinds_of(rig):
-        recordings = kind.unambiguous(rig, recordings)
+        recordings = kind.prepared(rig, recordings)
     with naming_recording_times(recordings):
         while True:
             try:
@@ -67,14 +69,12 @@ def _guess(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], No
         guess = guess_with_assumed_motion(rig, recordings)
         lap("first guess")
         return guess
-    for kind in kinds_of(rig):
-        recordings = [kind.cleaned(m) for m in recordings]
     inputs = inputs_for(rig, recordings)
     source, source_inputs, state = _trajectory(inputs, recordings, motion_kinds(rig))
     lap("first guess")
     if source_inputs is inputs and not source.refined_alone:
         return inputs, state, state.values
-    guess = _align_to_trajectory(inputs, source, *source.refined(source_inputs, state))
+    guess = _align_to_trajectory(source, source_inputs.rig, *source.refined(inputs, source_inputs, state))
     lap("other sensors")
     return guess
 
@@ -88,7 +88,7 @@ def _trajectory(
     if not kinds:
         raise EstimationError("no sensor of the rig shows its motion; add a camera, a LiDAR or a pose sensor.")
     kind, *fallbacks = kinds
-    source_inputs = inputs_of_sensors(inputs, recordings, kind.sources(inputs.rig))
+    source_inputs = inputs_of_sensors(inputs, recordings, sources_of(kind, inputs.rig))
 
     def fallback() -> tuple[Inputs, State]:
         return _trajectory(inputs, recordings, fallbacks)[1:]
@@ -126,12 +126,12 @@ def _on_assumed_motion(
 
 
 def _align_to_trajectory(
-    inputs: Inputs, source: Initializer[Any], source_inputs: Inputs, state: State, guess: Values
+    source: Initializer[Any], source_rig: Rig, inputs: Inputs, state: State, guess: Values
 ) -> InitialGuess:
-    """The initial guess for all sensors of `inputs`, from the trajectory in `state` by the sensors of `source_inputs`.
-    All other sensors are aligned to it. guess: of the parameters in `state`."""
-    rig, inputs = inputs.rig, source.adopted(inputs, source_inputs)
-    unplaced = [s for s in rig.mounted if s.name not in source_inputs.rig.sensors]
+    """The initial guess for all sensors of `inputs`, from the trajectory in `state` by the sensors of `source_rig`. All
+    other sensors are aligned to it. guess: of the parameters in `state`."""
+    rig = inputs.rig
+    unplaced = [s for s in rig.mounted if s.name not in source_rig.sensors]
     hosts = keyframe_hosts(unplaced)
     placed = place_sensors(inputs, state, hosts)
     if hosts or source.moves_keyframes:
@@ -234,8 +234,8 @@ def explained_failure(
     """The error with the cause of a breakdown, if the kind of sensor that gave the motion knows one; else `failed`."""
     if not isinstance(failed, NotDefiniteError):
         return failed
-    source = motion_kinds(rig)[0]
-    return source.explained(rig, recordings, lambda changed: _converged_attempt(changed, make) is not None) or failed
+    estimate = FailedEstimate(rig, recordings, failed, lambda changed: _converged_attempt(changed, make) is not None)
+    return motion_kinds(rig)[0].explained(estimate) or failed
 
 
 def _make_attempt(
@@ -248,10 +248,13 @@ def _make_attempt(
     """Initial guess and estimate of one rig. Raises EstimationError."""
     inputs, state, guess = guess_of_rig(rig, recordings, lap)
     trim_heap()
-    with ExitStack() as explaining:
-        for kind in kinds_of(rig):
-            explaining.enter_context(kind.explaining(inputs))
+    try:
         solution = determine(inputs, state, guess, Callbacks(on_step, partial(on_visit, inputs)))
+    except EstimationError as error:
+        failed = FailedEstimate(inputs.rig, [inputs.measurements], error)
+        if (reason := next(filter(None, (kind.explained(failed) for kind in kinds_of(rig))), None)) is not None:
+            raise reason from error
+        raise
     return Attempt(inputs, solution)
 
 

@@ -147,6 +147,11 @@ class Sensor:
         return False
 
     @property
+    def has_level_frame(self) -> bool:
+        """Whether z of its static frame points upwards or downwards."""
+        return False
+
+    @property
     def shared_frame(self) -> str:
         """Name of the sensor in whose frame this sensor reports, or `TARGET_FRAME`; empty if it shares no frame."""
         return ""

@@ -35,12 +35,12 @@ from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.console import plain_table
 from icalib.tools.inspection.facts import (
     Draft,
+    Facts,
     Finding,
     Inspection,
     Key,
     KindInspector,
     Printout,
-    SensorFacts,
     SensorSource,
     Sources,
     StreamFacts,
@@ -225,15 +225,15 @@ class ImuInspector(KindInspector):
         name = next(n for k in itertools.count() if (n := f"imu{k}") not in others)
         return dataclasses.replace(sources, sensors={name: ImuSource(self.sensor.sensor_type, gyro, pair), **others})
 
-    def read(self, recording: Recording, name: str, source: ImuSource) -> SensorFacts:
+    def read(self, recording: Recording, name: str, source: ImuSource) -> Facts:
         """Reads all readings; no facts if they cannot be read."""
         topic = source.topic
         try:
             imu, where, notes = read_imu(recording, name, source.halves or topic.name)
         except RecordingError as error:
-            return SensorFacts(stream=StreamFacts(topic, None, str(error)))
+            return Facts(stream=StreamFacts(topic, None, str(error)))
         facts = imu_facts(imu, where, frame_id(recording, topic), notes)
-        return SensorFacts(facts, StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem))
+        return Facts(facts, StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem))
 
     def draft(self, inspection: Inspection, active: bool) -> Draft:
         """Lines of the IMU to calibrate with."""

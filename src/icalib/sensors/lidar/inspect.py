@@ -12,15 +12,7 @@ from icalib.errors import RecordingError
 from icalib.sensors.lidar.read.point_clouds import point_clouds, timing_fields
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import Sensor, TimeUnit
-from icalib.tools.inspection.facts import (
-    Finding,
-    Inspection,
-    KindInspector,
-    SensorFacts,
-    SensorSource,
-    independent,
-    moving,
-)
+from icalib.tools.inspection.facts import Facts, Finding, Inspection, KindInspector, SensorSource, independent, moving
 
 
 @dataclass(frozen=True)
@@ -52,16 +44,16 @@ class LidarInspector(KindInspector):
     is_certain: ClassVar[bool] = True
     checks: ClassVar = {"use": refused}
 
-    def read(self, recording: Recording, name: str, source: SensorSource) -> SensorFacts:
+    def read(self, recording: Recording, name: str, source: SensorSource) -> Facts:
         """Findings from the first clouds of a bag; none from a folder."""
         if not isinstance(recording, BagRecording):
-            return SensorFacts()
+            return Facts()
         try:
             what = f"{recording.root} {source.topic.name} ({name})"
             lidar = Lidar(name, "", topic=source.topic.name)
-            return SensorFacts(LidarFacts(*timing_fields(point_clouds(recording, source.topic.name), lidar, what)))
+            return Facts(LidarFacts(*timing_fields(point_clouds(recording, source.topic.name), lidar, what)))
         except RecordingError as error:
-            return SensorFacts(LidarFacts(problem=str(error)))
+            return Facts(LidarFacts(problem=str(error)))
 
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """Lines of the draft rig file that name field and unit of the point times."""

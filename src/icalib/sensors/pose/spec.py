@@ -128,6 +128,10 @@ class PoseSensor(MountedSensor):
         """See `Sensor`: absolute poses are relative to a static frame."""
         return self.kind == "absolute"
 
+    @property
+    def has_level_frame(self) -> bool:
+        return self.has_frame and self.level
+
     def gives_motion_without_imu(self, has_target: bool) -> bool:
         return True
 

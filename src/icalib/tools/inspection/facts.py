@@ -117,7 +117,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class SensorFacts:
+class Facts:
     """What the messages of a sensor show. facts: a dataclass of its kind, or None; stream: facts on the topic that was
     read in full; None: only stamps are read."""
 
@@ -301,9 +301,9 @@ class KindInspector:
         left out."""
         return sources
 
-    def read(self, recording: Recording, name: str, source: Any) -> SensorFacts:
+    def read(self, recording: Recording, name: str, source: Any) -> Facts:
         """Reads the messages of the sensor as far as its kind has facts on them."""
-        return SensorFacts()
+        return Facts()
 
     def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> Inspection:
         """The inspection with what is searched for once all sensors are known: the target in images, transforms."""

@@ -29,9 +29,13 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.initializer import (
     BY_TARGET,
     BY_TRACKS,
+    BodyTrajectory,
+    FailedEstimate,
+    InitialGuess,
     Initializer,
     InputsWithMotion,
     KnownExtrinsics,
+    MotionSource,
     Values,
     converted_offset,
     fullest_recording,
@@ -81,15 +85,13 @@ class CameraInitializer(Initializer[Camera]):
     hosts_keyframes = True
     refined_alone = False  # a refinement would repeat the first pass of the estimator
 
-    def motion_rank(self, rig: Rig) -> int | None:
+    def motion_source(self, rig: Rig) -> MotionSource | None:
         """See `Initializer`: `BY_TARGET` with a target, `BY_TRACKS` with an IMU but no target, else None."""
-        if not rig.cameras:
+        if not rig.cameras or (rig.imu is None and not rig.has_target):
             return None
-        if rig.has_target:
-            return BY_TARGET
-        return None if rig.imu is None else BY_TRACKS
+        return MotionSource(BY_TARGET if rig.has_target else BY_TRACKS, tuple(c.name for c in rig.cameras))
 
-    def unambiguous(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+    def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
         """See `Initializer`: the points of symmetric targets are numbered consistently."""
         return resolve_symmetry(rig, recordings)
 
@@ -97,15 +99,15 @@ class CameraInitializer(Initializer[Camera]):
         """See `Initializer`: the trajectory interpolated between camera poses, and the guess of all cameras."""
         return initial_state(inputs, *_guesses_by_recording(inputs, fallback))
 
-    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+    def refined(self, inputs: Inputs, source_inputs: Inputs, state: State) -> InitialGuess:
         """See `Initializer`: refines the trajectory by the first pass of the estimator."""
-        return inputs, first_pass(inputs, state), state.values
+        return inputs, first_pass(source_inputs, state), state.values
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Camera]) -> Values:
         """Values of cameras with feature tracks, aligned to the trajectory in `state`."""
         return track_camera_values(inputs, state)
 
-    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
         """See `Initializer`: poses of the body from the images of all cameras, without an IMU."""
         cameras_only = rig.only(*(c.name for c in rig.cameras))
         inputs = inputs_for(cameras_only, [m.only(*cameras_only.sensors) for m in recordings])
@@ -116,13 +118,13 @@ class CameraInitializer(Initializer[Camera]):
         poses = [
             BodyPoses(t[recording == k] - begin, R[recording == k], p[recording == k]) for k, begin in enumerate(begins)
         ]
-        return poses, guess.values()
+        return BodyTrajectory(poses, guess.values())
 
-    def explained(
-        self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
-    ) -> EstimationError | None:
+    def explained(self, failed: FailedEstimate) -> EstimationError | None:
         """See `Initializer`: the error that feature tracks lack parallax, else None. None for rigs with a target."""
-        return None if rig.has_target else no_parallax(rig, recordings)
+        if failed.converges is None or failed.rig.has_target:
+            return None
+        return no_parallax(failed.rig, failed.recordings)
 
 
 def _guesses_by_recording(inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:

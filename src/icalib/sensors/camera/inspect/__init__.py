@@ -34,13 +34,13 @@ from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.console import plain_table
 from icalib.tools.inspection.facts import (
     Draft,
+    Facts,
     Finding,
     Inspection,
     Key,
     KindInspector,
     Printout,
     Progress,
-    SensorFacts,
     Sources,
     Timing,
     imu_timing,
@@ -276,10 +276,10 @@ class CameraInspector(KindInspector):
         again = {topic: f"the images of {name} once more" for name, camera in cameras for topic in camera.others}
         return dataclasses.replace(sources, left_out={**sources.left_out, **depth, **again})
 
-    def read(self, recording: Recording, name: str, source: CameraSource) -> SensorFacts:
+    def read(self, recording: Recording, name: str, source: CameraSource) -> Facts:
         """Reads all images, and CameraInfo."""
         stream, images = read_images(recording, source.images) if source.images else (None, None)
-        return SensorFacts(CameraFacts(images, _info(recording, source)), stream)
+        return Facts(CameraFacts(images, _info(recording, source)), stream)
 
     def searched(self, recording: Recording, inspection: Inspection, progress: Progress) -> Inspection:
         """Adds the views of a known target, or else words on the target in a few images."""

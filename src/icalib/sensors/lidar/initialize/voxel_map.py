@@ -310,17 +310,24 @@ DEGENERACIES = {
 
 @contextmanager
 def explaining_degeneracy(streams: Sequence[LidarStream]) -> Iterator[None]:
-    """Context that replaces an EstimationError by one that names the degenerate scene, if a LiDAR saw such a scene."""
+    """Context that replaces an EstimationError by `degeneracy_error`."""
     try:
         yield
     except EstimationError as error:
-        for stream in streams:
-            if (n := n_directions(stream)) in DEGENERACIES:
-                raise EstimationError(
-                    f"the flat surfaces that {stream.name} sees {DEGENERACIES[n]}; record where walls and floor "
-                    "face three directions, or together with a camera that sees a target."
-                ) from error
+        if (reason := degeneracy_error(streams)) is not None:
+            raise reason from error
         raise
+
+
+def degeneracy_error(streams: Sequence[LidarStream]) -> EstimationError | None:
+    """An error, not raised, that names the degenerate scene, if a LiDAR saw such a scene; else None."""
+    for stream in streams:
+        if (n := n_directions(stream)) in DEGENERACIES:
+            return EstimationError(
+                f"the flat surfaces that {stream.name} sees {DEGENERACIES[n]}; record where walls and floor "
+                "face three directions, or together with a camera that sees a target."
+            )
+    return None
 
 
 def n_directions(stream: LidarStream) -> int:

@@ -17,9 +17,13 @@ from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry import so3
 from icalib.initialize.initializer import (
     BY_POSES,
+    BodyTrajectory,
+    FailedEstimate,
+    InitialGuess,
     Initializer,
     InputsWithMotion,
     KnownExtrinsics,
+    MotionSource,
     SmoothMotion,
     Values,
     fullest_recording,
@@ -73,68 +77,50 @@ class PoseInitializer(Initializer[PoseSensor]):
     """The first pose sensor gives the trajectory if neither cameras nor LiDARs give it. All other pose sensors are
     aligned to the trajectory."""
 
-    def motion_rank(self, rig: Rig) -> int | None:
-        return BY_POSES if rig.poses else None
-
-    def sources(self, rig: Rig) -> tuple[str, ...]:
-        return (rig.poses[0].name,)
+    def motion_source(self, rig: Rig) -> MotionSource | None:
+        return MotionSource(BY_POSES, (rig.poses[0].name,)) if rig.poses else None
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         return state_from_poses(inputs)
 
-    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
+    def refined(self, inputs: Inputs, source_inputs: Inputs, state: State) -> InitialGuess:
         """State after one pass of the estimator, and extrinsics that are aligned to this improved trajectory."""
-        sensors = inputs.rig.poses
-        state = first_pass(inputs, replace(state, values=state.values | self.place(inputs, state, sensors)))
-        state = replace(state, values=state.values | self.place(inputs, state, sensors))
+        alone, sensors = source_inputs, source_inputs.rig.poses
+        state = first_pass(alone, replace(state, values=state.values | self.place(alone, state, sensors)))
+        state = replace(state, values=state.values | self.place(alone, state, sensors))
         return inputs, state, state.values
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PoseSensor]) -> Values:
         return pose_values(inputs, state, sensors)
 
-    def vertical(self, state: State, sensor: PoseSensor) -> np.ndarray | None:
-        frame = state.values.get((frame_of(sensor.name, 0), FRAME[0]))
-        return frame[:, 2] if sensor.level and sensor.kind == "absolute" and frame is not None else None
-
-    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
         streams = [m.poses[0] for m in recordings]
         if is_unstated(streams[0], rig.poses[0]):
             raise unstated(streams[0])
-        return [BodyPoses(s.seconds, s.rotation, s.position) for s in streams], {}
-
-    def check_moving(self, recording: Measurements) -> None:
-        for stream in recording.poses:
-            check_rate(stream)
+        poses = [BodyPoses(s.seconds, s.rotation, s.position) for s in streams]
+        return BodyTrajectory(poses, conventions=_rewritten(rig, recordings))
 
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
-    ) -> tuple[Inputs, State, Values] | None:
+    ) -> InitialGuess | None:
         """Initial guess by hand-eye calibration from pairs of poses, if the robot stood still at each pose; else
         None."""
-        if not is_stop_and_go(rig, recordings, body_poses):
-            return None
-        return state_from_pairs(rig, recordings, body_poses, values)
+        if is_stop_and_go(rig, recordings, body_poses):
+            return state_from_pairs(rig, recordings, body_poses, values)
+        for stream in (stream for m in recordings for stream in m.poses):
+            check_rate(stream)
+        return None
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         return motion.spacing_for_poses(*pose_noise([m.poses[0] for m in recordings]))
 
-    def rewritten(self, rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
-        sensor = rig.poses[0]
-        each = ([*conventions(m.poses[0], sensor), *other_axes(m.poses[0])] for m in recordings)
-        for others in zip(*each, strict=True):
-            if others[0].changes == 1 and "position_unit" not in "".join(others[0].fields):
-                yield (
-                    others[0].sentence(sensor.name),
-                    [m.with_streams(x.stream) for m, x in zip(recordings, others, strict=True)],
-                )
-
-    def explained(
-        self, rig: Rig, recordings: Sequence[Measurements], converges: Callable[[Rig], bool]
-    ) -> EstimationError | None:
+    def explained(self, failed: FailedEstimate) -> EstimationError | None:
         """An error that recommends kind: absolute, if relative poses fail but the same poses converge as absolute ones;
         else None."""
-        first = rig.poses[0]
-        if first.kind != "relative" or not converges(rig.with_sensors(replace(first, kind="absolute"))):
+        rig, first = failed.rig, failed.rig.poses[0]
+        if failed.converges is None or first.kind != "relative":
+            return None
+        if not failed.converges(rig.with_sensors(replace(first, kind="absolute"))):
             return None
         return EstimationError(
             f"{first.name}: with kind: relative its poses are too noisy to give the motion, with kind: absolute "
@@ -143,6 +129,16 @@ class PoseInitializer(Initializer[PoseSensor]):
 
 
 INITIALIZER = PoseInitializer()
+
+
+def _rewritten(rig: Rig, recordings: Sequence[Measurements]) -> Iterator[tuple[str, list[Measurements]]]:
+    """The conventions of `BodyTrajectory`: those that differ in one field of the rig file, which is not the unit."""
+    sensor = rig.poses[0]
+    each = ([*conventions(m.poses[0], sensor), *other_axes(m.poses[0])] for m in recordings)
+    for others in zip(*each, strict=True):
+        if others[0].changes == 1 and "position_unit" not in "".join(others[0].fields):
+            converted = [m.with_streams(x.stream) for m, x in zip(recordings, others, strict=True)]
+            yield others[0].sentence(sensor.name), converted
 
 
 # Initial extrinsics, time offset and frame of a pose sensor, and the IMU trajectory if no other sensor gives it.

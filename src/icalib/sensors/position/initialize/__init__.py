@@ -20,10 +20,11 @@ from icalib.estimate.problem import keyframe_times, keyframes_for, motion_of, st
 from icalib.geometry import so3
 from icalib.initialize.initializer import (
     BY_POSITIONS,
-    Fixes,
+    InitialGuess,
     Initializer,
     InputsWithMotion,
     KnownExtrinsics,
+    MotionSource,
     OtherMotionError,
     Values,
     converted_offset,
@@ -78,12 +79,19 @@ class PositionInitializer(Initializer[PositionSensor]):
     """See `Initializer`. The first position sensor gives the trajectory if no other kind of sensor does. Position
     sensors on a known trajectory get lever arm, time offset and frame."""
 
-    def motion_rank(self, rig: Rig) -> int | None:
-        """See `Initializer`. Positions need an IMU for the attitude, and a frame of their own for the world."""
-        return BY_POSITIONS if rig.imu is not None and self._with_frame(rig) else None
+    def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+        """With an IMU, the recordings without single wrong fixes, which would enlarge the estimated noise. Files are
+        cleaned when they are read; this cleans measurements that were made in memory."""
+        if rig.imu is None:
+            return recordings
+        streams = ((s.some(~single_wrong(s.seconds, s.position)) for s in m.of(PositionStream)) for m in recordings)
+        return [m.with_streams(*good) for m, good in zip(recordings, streams, strict=True)]
 
-    def sources(self, rig: Rig) -> tuple[str, ...]:
-        return (self._with_frame(rig)[0].name,)
+    def motion_source(self, rig: Rig) -> MotionSource | None:
+        """See `Initializer`. Positions need an IMU for the attitude, and a frame of their own for the world, which no
+        other sensor and no target has."""
+        framed = [s.name for s in rig.of(PositionSensor) if s.has_frame]
+        return MotionSource(BY_POSITIONS, (framed[0],)) if rig.imu is not None and framed else None
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         sensor = inputs.rig.of(PositionSensor)[0]
@@ -91,20 +99,9 @@ class PositionInitializer(Initializer[PositionSensor]):
         frames = _frames(inputs, sensor, [(np.eye(3), np.zeros(3))] * len(inputs.parts))
         return replace(state, values=state.values | frames)
 
-    def refined(self, inputs: Inputs, state: State) -> tuple[Inputs, State, Values]:
-        state = first_pass(inputs, state)
+    def refined(self, inputs: Inputs, source_inputs: Inputs, state: State) -> InitialGuess:
+        state = first_pass(source_inputs, state)
         return inputs, state, state.values
-
-    def cleaned(self, recording: Measurements) -> Measurements:
-        """The recording without single wrong fixes, which would enlarge the estimated noise. Files are cleaned when
-        they are read; this cleans measurements that were made in memory."""
-        return recording.with_streams(
-            *(s.some(~single_wrong(s.seconds, s.position)) for s in recording.of(PositionStream))
-        )
-
-    def fixes(self, recording: Measurements) -> list[Fixes]:
-        streams = recording.of(PositionStream)
-        return [Fixes(s.seconds, s.position[:, 0] + 1j * s.position[:, 1], s.origin_ns) for s in streams]
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[PositionSensor]) -> Values:
         """See `Initializer`. Sensors with a frame come first, because sensors without one may share it."""
@@ -112,11 +109,6 @@ class PositionInitializer(Initializer[PositionSensor]):
         for sensor in sorted(sensors, key=lambda s: not s.has_frame):
             out |= _on_motion(inputs, replace(state, values=state.values | out), sensor)
         return out
-
-    @staticmethod
-    def _with_frame(rig: Rig) -> list[PositionSensor]:
-        """The sensors that share no frame of another sensor or of the target."""
-        return [s for s in rig.of(PositionSensor) if s.has_frame]
 
 
 INITIALIZER = PositionInitializer()

@@ -7,19 +7,20 @@ from functools import partial
 
 import numpy as np
 
-from icalib.data.measurements import Measurements, WheelPoses, WheelStream
+from icalib.data.measurements import Measurements, PositionStream, WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import motion_of
 from icalib.geometry import so3
 from icalib.initialize.initializer import (
     BY_DEAD_RECKONING,
+    BodyTrajectory,
     Initializer,
+    MotionSource,
     SmoothMotion,
     Values,
     has_guesses,
     is_contradicted,
-    kinds_of,
     merged_values,
     offset_of_each_clock,
     possible_verticals,
@@ -27,7 +28,7 @@ from icalib.initialize.initializer import (
     single_recording,
     stated_values,
 )
-from icalib.initialize.smooth_trajectory import BodyPoses, SmoothTrajectory
+from icalib.initialize.smooth_trajectory import SmoothTrajectory
 from icalib.motion.factor import Extrinsics
 from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.poses import imu_poses, instants, is_known
@@ -41,7 +42,7 @@ from icalib.sensors.wheels.initialize.drive_guess import (
     wheel_offset,
     wheel_rates,
 )
-from icalib.sensors.wheels.initialize.path_on_fixes import paths_on_fixes, wheel_path
+from icalib.sensors.wheels.initialize.path_on_fixes import fixes_of, paths_on_fixes, wheel_path
 from icalib.sensors.wheels.residual import integrals_of
 from icalib.sensors.wheels.spec import REVERSED_YAW
 
@@ -58,19 +59,15 @@ class WheelInitializer(Initializer[Wheels]):
     def place(self, inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> Values:
         return wheel_values(inputs, state, sensors)
 
-    def motion_rank(self, rig: Rig) -> int | None:
-        return BY_DEAD_RECKONING if rig.imu is None else None
+    def motion_source(self, rig: Rig) -> MotionSource | None:
+        return MotionSource(BY_DEAD_RECKONING, (rig.wheels[0].name,)) if rig.imu is None else None
 
-    def sources(self, rig: Rig) -> tuple[str, ...]:
-        return (rig.wheels[0].name,)
-
-    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> tuple[list[BodyPoses], Values]:
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
         """See `Initializer`. Positions of a point of the vehicle bound the drift, and determine sizes of the wheels."""
         wheels, streams = rig.wheels[0], [m.wheels[0] for m in recordings]
-        fixes = [f for m in recordings for kind in kinds_of(rig) for f in kind.fixes(m)[:1]][: len(recordings)]
-        if fixes:
-            return paths_on_fixes(wheels, streams, fixes)
-        return [wheel_path(wheels, stream) for stream in streams], {}
+        if fixes := [fixes_of(s) for m in recordings for s in m.of(PositionStream)[:1]]:
+            return BodyTrajectory(*paths_on_fixes(wheels, streams, fixes))
+        return BodyTrajectory([wheel_path(wheels, stream) for stream in streams])
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         noise = [

@@ -19,10 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from icalib.data.measurements import WheelPoses, WheelStream
+from icalib.data.measurements import PositionStream, WheelPoses, WheelStream
 from icalib.errors import EstimationError
 from icalib.geometry import so3
-from icalib.initialize.initializer import Fixes, Values, merged_values
+from icalib.initialize.initializer import Values, merged_values
 from icalib.initialize.rate_correlation import MaskedSignal, best_shifts, closest_of_equals
 from icalib.initialize.smooth_trajectory import BodyPoses
 from icalib.rig import Wheels
@@ -41,6 +41,18 @@ DIFFERENCE = 1e-4  # half a step of central differences, of each unknown
 MAX_MISFIT = 0.15  # median residual over median distance from the centre of a window: another motion leaves more
 MIN_SIGMA_M = 0.01  # of a residual
 PRIOR_SIGMA = np.array([0.3, 0.3, 0.1, 2.0, 2.0, 0.3])  # of the unknowns about their start: 1, 1, rad/m, m, m, s
+
+
+class Fixes(NamedTuple):
+    """t (n,) s since the first stamp of the sensor, `origin_ns`; z (n,) complex: x + i y of its positions [m]."""
+
+    t: np.ndarray
+    z: np.ndarray
+    origin_ns: int = 0
+
+
+def fixes_of(stream: PositionStream) -> Fixes:
+    return Fixes(stream.seconds, stream.position[:, 0] + 1j * stream.position[:, 1], stream.origin_ns)
 
 
 class PathOnFixes(NamedTuple):
