@@ -1,4 +1,4 @@
-"""A new kind of sensor is a folder: no other module names a kind, so that none has to change for a new one.
+"""A new kind of sensor is a folder: hardly any other module names a kind, so that few have to change for a new one.
 
 `python tests/test_sensor_kinds.py` prints what the modules that still do name.
 """

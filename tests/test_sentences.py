@@ -108,6 +108,6 @@ def test_a_remark_of_any_test_must_have_its_sentence():
 def test_a_remark_is_text_that_keeps_its_identifier():
     remark = Remark("clock_drifts", DRIFT)
     assert remark == DRIFT and str(remark) == DRIFT and f"{remark}" == DRIFT and json.dumps(remark) == json.dumps(DRIFT)
-    copies = [pickle.loads(pickle.dumps(remark)), copy.deepcopy(remark), remark.saying(f"monday: {remark}")]
+    copies = [pickle.loads(pickle.dumps(remark)), copy.deepcopy(remark), remark.with_sentence(f"monday: {remark}")]
     assert names(copies) == ["clock_drifts"] * 3 and copies[:2] == [DRIFT] * 2 and copies[2] == f"monday: {DRIFT}"
     assert type(str(remark)) is str and named("clock_drifts", [remark]) is remark

@@ -8,7 +8,7 @@ from tests.remarks import remark
 from icalib.observability.assessor import Cause
 from icalib.result import SensorFit
 from icalib.sensors.camera.assess import image_velocity
-from icalib.validation.causes import Misfit, are_noise, explaining, ranked
+from icalib.validation.causes import Misfit, any_explains, are_noise, ranked
 
 
 def fits(*ratios: float) -> list[SensorFit]:
@@ -23,10 +23,10 @@ def test_the_largest_gain_comes_first_and_ties_keep_their_order():
 def test_a_cause_explains_a_misfit_by_its_gain_alone():
     misfit = Misfit.of(fits(1.0, 5.0))
     assert misfit.sensors == {"imu1"} and misfit.chi2 == 3600.0
-    assert explaining([Cause(remark("a"), 361.0)], misfit) and not explaining(
+    assert any_explains([Cause(remark("a"), 361.0)], misfit) and not any_explains(
         [Cause(remark("a"), 359.0), Cause(remark("b"), 10.0)], misfit
     )
-    assert not explaining([], misfit)
+    assert not any_explains([], misfit)
 
 
 def test_a_misfit_is_grave_from_four_times_the_noise_on():

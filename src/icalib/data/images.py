@@ -358,7 +358,7 @@ class _Dropped:
     def note(self, where: str, note: Note) -> None:
         for reason, count in self.count.items():
             sentence = f"{where}: {count} images that {reason} were left out, the first {self._first[reason]}."
-            note(reason.saying(sentence))
+            note(reason.with_sentence(sentence))
 
 
 def _usual_size(payloads: Iterable[Payload]) -> tuple[tuple[int, int], Iterator[Payload]]:

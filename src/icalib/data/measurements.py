@@ -253,7 +253,7 @@ def _length_ns(rig: Rig, measurements: Measurements) -> int:
 
 def _joined(recordings: Sequence[Measurements], shifts: Sequence[int]) -> Measurements:
     notes, warnings = (
-        tuple(words.saying(f"{m.name}: {words}") for m in recordings for words in getattr(m, kind))
+        tuple(words.with_sentence(f"{m.name}: {words}") for m in recordings for words in getattr(m, kind))
         for kind in ("notes", "warnings")
     )
     disjoint = _disjoint(recordings)

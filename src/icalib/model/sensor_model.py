@@ -66,7 +66,7 @@ class Clusters:
 
 class SensorModel(Generic[S, N]):
     """Interface of the sensors S of one kind for the estimator, with noise of the class N. The defaults fit a sensor
-    with a pose and a clock but no factor."""
+    with a pose and a clock; `first_noise` must be given."""
 
     # Measurements
 

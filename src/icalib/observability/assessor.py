@@ -68,8 +68,9 @@ class Assessment:
     notes: on data and noise. ambiguities: notes on other values that fit as well. warnings: on data. value_warnings: on
     estimates that cannot be right.
 
-    causes: wrong values in the rig file. clock_causes: clocks that the model leaves out. unreliable: kinds of residuals
-    that mean nothing. many_rejected: on outliers. overstated_noise: on noise stated too large.
+    causes: wrong values in the rig file, and effects that the model leaves out. clock_causes: clocks that it leaves
+    out. unreliable: kinds of residuals that mean nothing. many_rejected: on outliers. overstated_noise: on noise stated
+    too large.
     """
 
     residuals: Iterable[Residuals] | None = None

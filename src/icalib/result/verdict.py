@@ -176,7 +176,7 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
             meaning = _MEANINGS[verdict]
-            yield meaning.saying(f"{_listed(names)}: {meaning.format(more=_more(c))}.")
+            yield meaning.with_sentence(f"{_listed(names)}: {meaning.format(more=_more(c))}.")
 
 
 def _more(c: Calibration) -> str:

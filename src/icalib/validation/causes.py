@@ -51,10 +51,10 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known = stated
-    if not explaining([c for c in stated if c.gain < np.inf], misfit) and not against:
+    if not any_explains([c for c in stated if c.gain < np.inf], misfit) and not against:
         scattering = assessed.factor > LARGE_FACTOR
-        known = [*stated, *changing(assessed, misfit, scattering)]
-    both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, explaining(known, misfit))])
+        known = [*stated, *varying_causes(assessed, misfit, scattering)]
+    both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
 
@@ -117,11 +117,11 @@ def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) ->
 
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
 # than 0.01.
-EXPLAINS = 0.1
+MIN_EXPLAINED_SHARE = 0.1
 # Share that one change must gain of the gain by separate parameters for each segment. A simulated change gains 0.36 to
 # 0.99, less if it is far from a segment boundary. On EuRoC, where lens and board do not follow the model, the best
 # change gains 0.04.
-CHANGES = 0.25
+MIN_CHANGE_SHARE = 0.25
 ALIKE = 0.8  # share of the best gain from which on another change explains the data as well
 LARGE = 2.0  # tolerances; a constant value is wrong by half of a change
 INERTIAL = ("gyroscope", "accelerometer")
@@ -165,15 +165,15 @@ def ranked(causes: Iterable[Cause]) -> list[Cause]:
     return sorted(causes, key=lambda c: -c.gain)
 
 
-def explaining(causes: Iterable[Cause], misfit: Misfit) -> bool:
-    """Whether one of the causes gains at least the share EXPLAINS of the misfit."""
-    return any(c.gain >= EXPLAINS * misfit.chi2 for c in causes)
+def any_explains(causes: Iterable[Cause], misfit: Misfit) -> bool:
+    """Whether one of the causes gains at least the share MIN_EXPLAINED_SHARE of the misfit."""
+    return any(c.gain >= MIN_EXPLAINED_SHARE * misfit.chi2 for c in causes)
 
 
 # Causes that vary over the recording.
 
 
-def changing(assessed: AssessedEstimate, misfit: Misfit, scattering: bool) -> Iterator[Cause]:
+def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool) -> Iterator[Cause]:
     """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
     parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
     for assessment in assessments(assessed):
@@ -191,7 +191,7 @@ def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeli
     """The change that explains clearly more than all others, if there is one. Two that explain as much are named
     together if they are the same change, seen from either sensor, or changes of one sensor."""
     by_gain, spread = changes(segments, inputs.sensors), scatter(segments)
-    if not by_gain or by_gain[0].gain < CHANGES * spread.beyond_chance or not spread.exceeded_by(by_gain[0]):
+    if not by_gain or by_gain[0].gain < MIN_CHANGE_SHARE * spread.beyond_chance or not spread.exceeded_by(by_gain[0]):
         return
     best = by_gain[0]
     alike = [c for c in by_gain if c.gain > ALIKE * best.gain]
@@ -199,7 +199,7 @@ def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeli
     if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
         words = _change_words(alike, segments, timeline)
         share = f" This explains {min(best.gain / spread.beyond_chance, 1.0):.0%} of what varies over the recording."
-        yield Cause(words.saying(words + share), best.gain, misfit.is_grave or _is_large(best, segments))
+        yield Cause(words.with_sentence(words + share), best.gain, misfit.is_grave or _is_large(best, segments))
 
 
 def _is_large(c: Change, segments: Segments) -> bool:
@@ -219,7 +219,7 @@ def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -
     what = " or ".join(size for size, _ in changed)
     advice = " ".join(dict.fromkeys(against for _, against in changed))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
-    return changed[0][0].saying(
+    return changed[0][0].with_sentence(
         f"{_names(best)} changes {when}: {what}{instead}. {advice} Record again"
         f"{_apart(best, timeline, ', or calibrate the recording before or after that alone')}."
     )
@@ -365,8 +365,8 @@ def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -
     explained: whether a named cause explains the misfit; then one sentence states the residuals."""
     rig, fits = assessed.inputs.rig, assessed.fits
     yield from (Cause(sentence, 0.0) for a in assessments(assessed) for sentence in a.many_rejected)
-    scatter = _scatter_over_stated(assessed.inputs)
-    noise = list(_noise_of_imu(assessed, misfit, scatter))
+    noise_ratio = _noise_over_stated(assessed.inputs)
+    noise = list(_noise_of_imu(assessed, misfit, noise_ratio))
     yield from noise
     if explained:
         if misfit.fits:
@@ -377,7 +377,7 @@ def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -
                 0.0,
             )
         return
-    if not noise or any(scatter[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
+    if not noise or any(noise_ratio[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
         yield from _unknown(rig, assessed.estimate, misfit)
     for f in fits:
         if sentence := misfit_words(rig, f, _is_noise(assessed.estimate, f)):
@@ -393,21 +393,21 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> Remark | None:
     return assessors()[sensor.sensor_type].misfit(sensor, f, is_noise)
 
 
-def _noise_of_imu(assessed: AssessedEstimate, misfit: Misfit, scatter: Mapping[str, float]) -> Iterator[Cause]:
+def _noise_of_imu(assessed: AssessedEstimate, misfit: Misfit, noise_ratio: Mapping[str, float]) -> Iterator[Cause]:
     """Causes that are noise of the IMU, stated too small or too large. Another noise is advised only if the readings
-    show it by themselves. scatter: see `_scatter_over_stated`."""
+    show it by themselves. noise_ratio: see `_noise_over_stated`."""
     imu, imu_fits = assessed.inputs.rig.imu, [f for f in assessed.fits if f.kind in INERTIAL]
     if imu is None or not imu_fits:
         return
     small = [f for f in imu_fits if is_small(f)]
     overstated = tuple(s for a in assessments(assessed) for s in a.overstated_noise)
-    if any(scatter[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
-        scales = {kind: max(s, 1.0) for kind, s in scatter.items()}
+    if any(noise_ratio[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
+        scales = {kind: max(s, 1.0) for kind, s in noise_ratio.items()}
         yield Cause(noise_words(imu, scales), misfit.chi2, misfit.is_grave)
     elif overstated:  # the trajectory then follows the IMU, and its residuals become small
         yield from (Cause(sentence, 0.0) for sentence in overstated)
-    elif small and all(scatter[f.kind] < 1.0 / CLEARLY for f in small):
-        scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), scatter[f.kind]) for f in small}
+    elif small and all(noise_ratio[f.kind] < 1.0 / CLEARLY for f in small):
+        scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), noise_ratio[f.kind]) for f in small}
         yield Cause(noise_words(imu, scales), 0.0)
     elif small:
         sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
@@ -465,7 +465,7 @@ def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
     )
 
 
-def _scatter_over_stated(inputs: Inputs) -> dict[str, float]:
+def _noise_over_stated(inputs: Inputs) -> dict[str, float]:
     """By kind of INERTIAL: the noise density that the readings show in quiet moments over the stated one; NaN without
     an IMU."""
     if inputs.imu is None or inputs.rig.imu is None or inputs.rig.assumes_motion:

@@ -291,7 +291,8 @@ class JobRecord:
         low, high = WALL_CLOCK_NS
         blocks = tuple(_block_record(result, g) for g in nontrivial_groups(result) if g.sensor in result.rig["sensors"])
         known = stamp if low <= stamp < high else None
-        about = (result.status, known, result.unobservable, result.warnings, blocks, result.verdict)
+        unobservable, warnings = (tuple(map(str, said)) for said in (result.unobservable, result.warnings))
+        about = (result.status, known, unobservable, warnings, blocks, result.verdict)
         return cls(name, result.failure, seconds, inputs, *about)
 
 

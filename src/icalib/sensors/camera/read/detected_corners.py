@@ -92,7 +92,7 @@ def find_corners(
     corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
     damaged = sorted(files.keys() - set(stamps_ns.tolist()))
     notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, files))
-    return corners, tuple(note.saying(f"{where}: {note}") for note in notes)
+    return corners, tuple(note.with_sentence(f"{where}: {note}") for note in notes)
 
 
 def _called(target: Target) -> str:

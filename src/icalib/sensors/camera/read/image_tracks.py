@@ -117,7 +117,7 @@ def find_tracks(
         if keep:
             keep_arrays(key, {name: np.asarray(getattr(tracks, name)) for name in (*_COLUMNS, *_COUNTS)})
     stream = _stream(camera.name, tracks, where)
-    return stream, tuple(note.saying(f"{where}: {note}") for note in _notes(tracks, files))
+    return stream, tuple(note.with_sentence(f"{where}: {note}") for note in _notes(tracks, files))
 
 
 def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _TrackArrays:

@@ -104,7 +104,7 @@ class _Notes:
             f"{self.what}: {int(bad.sum())} of {len(bad)} readings {why} and were left out, the first "
             f"{(first - self._begin_ns) * 1e-9:.3f} s from the start, at {first} ns."
         )
-        self.sentences += (why.saying(sentence),)
+        self.sentences += (why.with_sentence(sentence),)
 
 
 def _some(imu: ImuStream, which: np.ndarray) -> ImuStream:
