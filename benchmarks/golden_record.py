@@ -80,7 +80,7 @@ def record_case(case: Case, data: Path, rounds: int = 1) -> Record:
         if isinstance(found, CalibrationError):
             notes = getattr(found, "__notes__", ())
             return Record(
-                cpu_s=spent, refusal=str(found), notes=[*notes], note_names=[note.identifier for note in notes]
+                cpu_s=spent, refusal=str(found), notes=[*notes], note_names=[note.name for note in notes]
             )
         return replace(record_of(found), visits=visits, cpu_s=spent)
 
@@ -116,9 +116,9 @@ def record_of(result: Calibration) -> Record:
         float(sum(f.chi2 for f in result.fits)),
         overall=result.verdict,
         reasons=list(result.reasons),
-        reason_names=[remark.identifier for remark in result.reasons],
+        reason_names=[remark.name for remark in result.reasons],
         notes=list(result.notes),
-        note_names=[remark.identifier for remark in result.notes],
+        note_names=[remark.name for remark in result.notes],
         files=_digests(result),
     )
 

@@ -224,7 +224,7 @@ def reasons(case: Case) -> tuple[str, tuple[str, ...]]:
 def named(sentence: str) -> set[str]:
     """The causes that a sentence names: a `Remark` by its identifier, a refusal by its words."""
     if isinstance(sentence, Remark):
-        return {cause for cause, names in CAUSES.items() if sentence.identifier in names}
+        return {cause for cause, names in CAUSES.items() if sentence.name in names}
     return {cause for cause, words in REFUSED_FOR.items() if re.search(words, sentence)}
 
 

@@ -22,12 +22,12 @@ def remark(sentence: str) -> Remark:
 
 def names(remarks: Iterable[Remark]) -> list[str]:
     """Identifiers of the remarks, in their order."""
-    return [remark.identifier for remark in remarks]
+    return [remark.name for remark in remarks]
 
 
 def named(name: str, remarks: Iterable[Remark]) -> Remark:
     """The only remark with this identifier."""
-    (found,) = (r for r in remarks if r.identifier == name)
+    (found,) = (r for r in remarks if r.name == name)
     return found
 
 

@@ -85,6 +85,6 @@ def test_a_contradiction_is_said_and_covered():
 def test_nothing_is_said_of_poses_that_agree(kind):
     rig, measured, truth = scene(kind, 3, np.zeros(3), 2e-3)
     result = calibrate_measurements(rig, measured)
-    assert not any("contradict" in w.identifier for w in result.warnings)
+    assert not any("contradict" in w.name for w in result.warnings)
     for block, e in zip(BLOCKS, errors(result, truth, "mocap0"), strict=True):
         assert (np.abs(e) < 4.0 * result.group("mocap0", block).std).all(), block

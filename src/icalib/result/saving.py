@@ -100,7 +100,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "verdict": c.verdict,
         "reasons": list(c.reasons),
         **{name: list(getattr(c, name)) for name in _REMARKS},
-        "identifiers": {name: [r.identifier for r in getattr(c, name)] for name in ("reasons", *_REMARKS)},
+        "identifiers": {name: [r.name for r in getattr(c, name)] for name in ("reasons", *_REMARKS)},
         **{name: getattr(c, name) for name in _PLAIN},
         "made": c.made,
     }
@@ -327,7 +327,7 @@ def calibration_yaml(calibration: Calibration) -> str:
 
 
 def _by_name(remarks: Iterable[Remark]) -> list[dict[str, str]]:
-    return [{r.identifier: str(r)} for r in remarks]
+    return [{r.name: str(r)} for r in remarks]
 
 
 def parameter_keys(groups: tuple[ParameterGroup, ...]) -> dict[tuple[str, str], str]:
