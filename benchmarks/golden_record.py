@@ -79,9 +79,7 @@ def record_case(case: Case, data: Path, rounds: int = 1) -> Record:
         found, visits, spent = _run(inputs, rounds - 1)
         if isinstance(found, CalibrationError):
             notes = getattr(found, "__notes__", ())
-            return Record(
-                cpu_s=spent, refusal=str(found), notes=[*notes], note_names=[note.name for note in notes]
-            )
+            return Record(cpu_s=spent, refusal=str(found), notes=[*notes], note_names=[note.name for note in notes])
         return replace(record_of(found), visits=visits, cpu_s=spent)
 
 

@@ -157,11 +157,7 @@ def write_ros1(path: Path, messages: list[Message], compression: str = "") -> Pa
     writer.chunk_threshold = 4096
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression.upper()])
-    with writer:
-        topics = {(topic, kind) for topic, kind, _, _ in messages}
-        connections = {t: writer.add_connection(t, kind, typestore=maker.store) for t, kind in sorted(topics)}
-        for topic, kind, received_ns, message in messages:
-            writer.write(connections[topic], received_ns, maker.serialise(kind, message))
+    _write(writer, maker, messages)
     return path
 
 
@@ -171,12 +167,16 @@ def write_ros2(path: Path, messages: list[Message], plugin: str = "SQLITE3", mod
     writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[plugin])
     if mode:
         writer.set_compression(CompressionMode[mode], CompressionFormat.ZSTD)
+    _write(writer, maker, messages)
+    return path
+
+
+def _write(writer: Any, maker: Maker, messages: list[Message]) -> None:
     with writer:
         topics = {(topic, kind) for topic, kind, _, _ in messages}
         connections = {t: writer.add_connection(t, kind, typestore=maker.store) for t, kind in sorted(topics)}
         for topic, kind, received_ns, message in messages:
             writer.write(connections[topic], received_ns, maker.serialise(kind, message))
-    return path
 
 
 def write_mcap(path: Path, messages: list[Message], kind: Store = "ros2", **options: Any) -> Path:

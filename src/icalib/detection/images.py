@@ -246,11 +246,10 @@ def sightings(target: Target, images: list[ImageCorners]) -> tuple[Remark, ...]:
     words = ", ".join(f"{name} is in {n}" for name, n in counts.items())
     missing = " and ".join(name for name, n in counts.items() if not n)
     notes = (Remark("target_sightings", f"{words} of {len(images)} images, {kept} corners{tail}."),)
-    return (
-        (*notes, Remark("target_never_seen", f"{missing} is never seen; check its type, family, ids and sizes."))
-        if missing
-        else notes
-    )
+    if missing:
+        sentence = f"{missing} is never seen; check its type, family, ids and sizes."
+        notes = (*notes, Remark("target_never_seen", sentence))
+    return notes
 
 
 def number_continuously(target: Target, images: Sequence[ImageCorners]) -> list[ImageCorners]:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,6 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.initializer import (
     BodyTrajectory,
     InitialGuess,
-    Initializer,
     MotionContradictedError,
     SmoothMotion,
     Values,
@@ -88,7 +86,7 @@ def _with_rate(sentence: str, body: Stream) -> str:
 
 def _guess(rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTrajectory) -> InitialGuess:
     """As `guess_with_assumed_motion`, without trying other conventions of the poses. trajectory: of the source."""
-    motion = _BodyMotion.by(motion_kinds(rig)[0], rig, recordings, trajectory)
+    motion = _BodyMotion.by(rig, recordings, trajectory)
     for kind in kinds_of(rig):
         if (still := kind.start_at_rest(rig, recordings, motion.body, motion.values)) is not None:
             return still
@@ -130,12 +128,10 @@ class _BodyMotion:
     odometry: str | None = None
 
     @classmethod
-    def by(
-        cls, source: Initializer[Any], rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTrajectory
-    ) -> _BodyMotion:
-        """Poses of the body from the `trajectory` of `source`. If the body is of another kind, all sensors that host
-        keyframes are aligned to it first."""
-        paths = trajectory.poses
+    def by(cls, rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTrajectory) -> _BodyMotion:
+        """Poses of the body from the `trajectory` of the sensors that show it. If the body is of another kind, all
+        sensors that host keyframes are aligned to it first."""
+        source, paths = motion_kinds(rig)[0], trajectory.poses
         if initializer_of(rig.sensors[rig.reference]) is source:
             return cls(paths, trajectory.values)
         (name,) = sources_of(source, rig)

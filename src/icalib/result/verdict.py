@@ -134,11 +134,9 @@ def lens_verdict(c: Calibration, camera: str) -> Verdict:
     """Verdict on a lens: its projection uncertainty compared with `pixel_tolerance` of the settings."""
     sigma = lens_projection_px(c, camera)
     verdicts = {v for g in c.groups if g.sensor == camera and g.name in c.lenses[camera] for v in g.verdict}
-    return (
-        "fixed"
-        if sigma is None
-        else component_verdict(sigma / tolerance(c, "pixel_tolerance"), "unobservable" in verdicts)
-    )
+    if sigma is None:
+        return "fixed"
+    return component_verdict(sigma / tolerance(c, "pixel_tolerance"), "unobservable" in verdicts)
 
 
 def tolerance(c: Calibration, name: str) -> float:

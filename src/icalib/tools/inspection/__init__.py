@@ -106,8 +106,9 @@ def _read(
         facts[name] = reading.facts
         if reading.stream is not None:
             read[reading.stream.topic] = reading.stream
-    stamps = (t for t in topics if t not in read)
-    read |= {t: _read_stamps(recording, t, t.name in sources.left_out) for t in stamps}
+    for k, topic in enumerate([t for t in topics if t not in read], len(read)):
+        progress(f"reading {topic.name}", k / len(topics))
+        read[topic] = _read_stamps(recording, topic, topic.name in sources.left_out)
     return tuple(read[topic] for topic in topics), facts
 
 

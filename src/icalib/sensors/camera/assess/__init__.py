@@ -24,7 +24,7 @@ from icalib.rig import Camera, Rig
 from icalib.sensors.camera.assess.lenses import ambiguities, is_far_guess, wrong_lenses, wrong_models, wrong_resolutions
 from icalib.sensors.camera.corner_bias import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
-from icalib.sensors.camera.corner_noise import NoiseModel, image_flow
+from icalib.sensors.camera.corner_noise import NoiseModel, flow_of_views
 from icalib.sensors.camera.model import CameraNoise, words_on_left_out
 from icalib.sensors.camera.spec import BLOOM, INTRINSICS, LENS
 from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
@@ -233,16 +233,22 @@ def _rolling_shutters(inputs: Inputs, estimate: Estimate) -> list[_Shutter]:
 def _shutter(factor: CornerFactor, out: CornerOutput, state: State, rows: int) -> _Shutter:
     """Regression of corner residuals on row times image velocity. It understates the time, because the motion follows
     some of the effect."""
-    used = np.flatnonzero(out.root > 0.0)
-    weight, residual = out.root[used, None].astype(np.float64), out.residual[used].astype(np.float64)
-    row = factor.stream.uv[used, 1] / rows - 0.5
-    effect, residual = weight * row[:, None] * image_flow(factor, state)[used], weight * residual
-    square, along = float(np.vdot(effect, effect)), float(np.vdot(effect, residual))
+    square = along = total = 0.0
+    for v0, v1 in factor.blocks():
+        corners = factor.corners_of(v0, v1)
+        used = out.root[corners] > 0.0
+        weight = out.root[corners][used, None].astype(np.float64)
+        row = factor.stream.uv[corners][used, 1:] / rows - 0.5
+        effect = weight * row * flow_of_views(factor, state, v0, v1)[used]
+        residual = weight * out.residual[corners][used]
+        square += float(np.vdot(effect, effect))
+        along += float(np.vdot(effect, residual))
+        total += float(np.vdot(residual, residual))
     if square == 0.0 or along == 0.0:
         return _Shutter(factor.name, 0.0, 0.0, 0.0)
     gain = along**2 / square
     # Residuals are predicted minus measured. A late row shows points farther along their motion.
-    return _Shutter(factor.name, -along / square, gain / float(np.vdot(residual, residual)), gain)
+    return _Shutter(factor.name, -along / square, gain / total, gain)
 
 
 def _shutter_words(s: _Shutter) -> Remark:

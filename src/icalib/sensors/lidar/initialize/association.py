@@ -89,7 +89,8 @@ def _single_state(inputs: Inputs, extrinsics: KnownExtrinsics | None = None) -> 
     initial = merged_values(lidar, known, estimated) if guess.rotation_observable else estimated | known
     values = start_values(inputs, initial)
     hosts = {(x.name, "time_offset"): values[lidar.name, "time_offset"] for x in inputs.rig.lidars}
-    keyframes = keyframes_for(inputs, dict([*keyframe_times(inputs, hosts).items()][:1]))
+    first, times = next(iter(keyframe_times(inputs, hosts).items()))
+    keyframes = keyframes_for(inputs, {first: times})
     rotation, position, velocity = motion.at(keyframes)
     return State(keyframes, rotation, position, velocity, np.tile(motion.bias, (len(keyframes), 1)), values)
 
