@@ -96,6 +96,15 @@ def edge_by_rows(camera: SimCamera, T_world_cam: np.ndarray) -> np.ndarray:
     return fine.reshape(height, 40).mean(axis=1)
 
 
+def test_a_lens_that_no_ray_passes_sees_background():
+    """A tangential distortion far beyond any lens: the search for a ray meets a singular equation."""
+    camera = SimCamera(
+        "cam0", "pinhole-radtan", (320, 240), (200.0, 200.0, 160.0, 120.0), (0.0, 0.0, 1.0, 0.0), np.eye(4)
+    )
+    rays = unproject(camera, np.stack(np.meshgrid(np.arange(-2.0, 322.0), np.arange(-2.0, 242.0)), axis=-1))
+    assert np.isnan(rays).any()
+
+
 @each("blur", [0.0, 0.45, 0.9])
 @each("camera", LENSES)
 @each("shift", [0.0, 0.0031, 0.0057])

@@ -99,7 +99,8 @@ def _undistorted(above, below, p1, p2, image):
         by_w = radial + s * slope + 2.0 * (w.conjugate() * q + w * q.conjugate())
         by_conj = w * w * slope + 2.0 * w * q
         scale = by_w.real**2 + by_w.imag**2 - by_conj.real**2 - by_conj.imag**2
-        step = (by_conj * error.conjugate() - by_w.conjugate() * error) / scale
+        product = by_conj * error.conjugate() - by_w.conjugate() * error
+        step = complex(product.real / scale, product.imag / scale)  # a complex divisor of zero would raise an error
         w += step
         if abs(step.real) + abs(step.imag) < 1e-13:
             return w
