@@ -19,11 +19,11 @@ from icalib.optim.arrowhead import (
 from icalib.optim.state import KEYFRAME_DIM
 
 
-def random_pieces(n_keyframes, n_calib, seed=0, calib_rank=None):
+def random_pieces(n_keyframes, n_calib, seed=0, calib_rank=None, dim=KEYFRAME_DIM):
     """Pieces filled with the sums of random factors: each on two neighbouring keyframes and the calibration parameters,
     or on one keyframe."""
     rng = np.random.default_rng(seed)
-    pieces = make_pieces(n_keyframes, n_calib)
+    pieces = make_pieces(n_keyframes, n_calib, dim)
     mix = np.eye(n_calib)
     if calib_rank is not None:
         mix = rng.normal(size=(calib_rank, n_calib))
@@ -36,7 +36,7 @@ def random_pieces(n_keyframes, n_calib, seed=0, calib_rank=None):
             for rows, both in ((22, True), (30, False)):
                 if (both and not pair) or (not both and not own):
                     continue
-                A, B = rng.normal(size=(2, rows, KEYFRAME_DIM))
+                A, B = rng.normal(size=(2, rows, dim))
                 C, r = rng.normal(size=(rows, len(mix))) @ mix, rng.normal(size=rows)
                 add_factor(piece, k, A, B if both else None, C, r)
     return pieces

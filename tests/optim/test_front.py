@@ -11,10 +11,10 @@ from icalib.optim.front import GROUP_SIZES, FeatureSums, PieceFeatures, plan
 from icalib.optim.state import KEYFRAME_DIM
 
 
-def random_images(n, per_keyframe, by_next, rng):
+def random_images(n, per_keyframe, by_next, rng, dim):
     """Node (I,) of each image, and poses by keyframe and by the next one."""
     keyframe = np.repeat(np.arange(n - by_next), per_keyframe)
-    pose = rng.normal(size=(len(keyframe), 6, KEYFRAME_DIM))
+    pose = rng.normal(size=(len(keyframe), 6, dim))
     return keyframe, pose, rng.normal(size=pose.shape) if by_next else pose[:0]
 
 
@@ -25,8 +25,8 @@ def random_sums(piece, n_tracks, images, rng, whole):
     calibration parameters, residual) are appended."""
     n, B = piece.last - piece.first + 1, piece.calib.shape[0] - 1
     for k in range(n - 1):
-        A, C, r = rng.normal(size=(40, 2 * KEYFRAME_DIM)), rng.normal(size=(40, B)), rng.normal(size=40)
-        whole.append((KEYFRAME_DIM * (piece.first + k), A, None, None, None, None, C, r))
+        A, C, r = rng.normal(size=(40, 2 * piece.dim)), rng.normal(size=(40, B)), rng.normal(size=40)
+        whole.append((piece.dim * (piece.first + k), A, None, None, None, None, C, r))
     pairs, (keyframe, pose, next_pose) = [], images
     for f in range(n_tracks):
         begin, length = rng.integers(len(keyframe)), rng.integers(1, 1 + len(keyframe))
@@ -37,7 +37,7 @@ def random_sums(piece, n_tracks, images, rng, whole):
             G, F = rng.normal(size=(3, 6)), rng.normal(size=(3, 3))
             C, r = rng.normal(size=(3, B)), rng.normal(size=3)
             A = np.concatenate([G @ pose[i], *([G @ next_pose[i]] if len(next_pose) else [])], axis=1)
-            whole.append((KEYFRAME_DIM * (piece.first + keyframe[i]), A, f, i, F, G, C, r))
+            whole.append((piece.dim * (piece.first + keyframe[i]), A, f, i, F, G, C, r))
     return np.array(pairs, dtype=np.int64).reshape(-1, 2)
 
 
@@ -45,15 +45,15 @@ def add(piece, sums, rows):
     """The same factors in the sums of the piece."""
     index = {pair: e for e, pair in enumerate(zip(sums.track.tolist(), sums.image.tolist(), strict=True))}
     for column, A, f, i, F, G, C, r in rows:
-        k = column // KEYFRAME_DIM - piece.first
+        k = column // piece.dim - piece.first
         Cr = np.concatenate([C, r[:, None]], axis=1)
-        piece.diagonal[k] += A[:, :KEYFRAME_DIM].T @ A[:, :KEYFRAME_DIM]
-        piece.side[k] += A[:, :KEYFRAME_DIM].T @ Cr
+        piece.diagonal[k] += A[:, : piece.dim].T @ A[:, : piece.dim]
+        piece.side[k] += A[:, : piece.dim].T @ Cr
         piece.calib += Cr.T @ Cr
-        if A.shape[1] > KEYFRAME_DIM:
-            piece.upper[k] += A[:, :KEYFRAME_DIM].T @ A[:, KEYFRAME_DIM:]
-            piece.diagonal[k + 1] += A[:, KEYFRAME_DIM:].T @ A[:, KEYFRAME_DIM:]
-            piece.side[k + 1] += A[:, KEYFRAME_DIM:].T @ Cr
+        if A.shape[1] > piece.dim:
+            piece.upper[k] += A[:, : piece.dim].T @ A[:, piece.dim :]
+            piece.diagonal[k + 1] += A[:, piece.dim :].T @ A[:, piece.dim :]
+            piece.side[k + 1] += A[:, piece.dim :].T @ Cr
         if f is not None:
             sums.diagonal[f] += F.T @ F
             sums.side[f] += F.T @ Cr
@@ -61,16 +61,20 @@ def add(piece, sums, rows):
     piece.calib[-1, -1] = 0.0
 
 
-def build(n_keyframes, n_tracks, n_calib, seed=0, pieces=None, per_keyframe=1, by_next=False, sizes=(2,)):
+def build(
+    n_keyframes, n_tracks, n_calib, seed=0, pieces=None, per_keyframe=1, by_next=False, sizes=(2,), dim=KEYFRAME_DIM
+):
     """Pieces with features, and the dense normal equations of chain and calibration parameters, features eliminated."""
     rng, J = np.random.default_rng(seed), []
-    pieces = make_pieces(n_keyframes, n_calib) if pieces is None else pieces
-    o, width = KEYFRAME_DIM * n_keyframes, KEYFRAME_DIM * n_keyframes + n_calib + 1 + 3 * n_tracks * len(pieces)
+    pieces = make_pieces(n_keyframes, n_calib, dim) if pieces is None else pieces
+    o, width = dim * n_keyframes, dim * n_keyframes + n_calib + 1 + 3 * n_tracks * len(pieces)
     for i, piece in enumerate(pieces):
         rows, n, keep = [], piece.last - piece.first + 1, len(pieces) > 1
-        images = random_images(n, per_keyframe, by_next, rng)
+        images = random_images(n, per_keyframe, by_next, rng, dim)
         pairs = random_sums(piece, n_tracks, images, rng, rows)
-        sums = FeatureSums.zeros(n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], n_calib, by_next)
+        sums = FeatureSums.zeros(
+            n_tracks, pairs[:, 0].copy(), pairs[:, 1].copy(), images[0], piece.side.shape[1:], by_next
+        )
         sums.pose[:], sums.next_pose[:] = images[1:]
         add(piece, sums, rows)
         piece.features = PieceFeatures.of(sums, plan(sums, n, piece.first == 0 or not keep, keep, sizes=sizes))
@@ -88,7 +92,7 @@ def build(n_keyframes, n_tracks, n_calib, seed=0, pieces=None, per_keyframe=1, b
 
 
 def check(pieces, H, g, n_keyframes):
-    step, o = np.linalg.solve(H, -g), KEYFRAME_DIM * n_keyframes
+    step, o = np.linalg.solve(H, -g), pieces[0].dim * n_keyframes
     information = H[o:, o:] - H[o:, :o] @ np.linalg.solve(H[:o, :o], H[:o, o:])
     solution = solve(pieces, n_keyframes, np.ones(len(H) - o))
     found = np.concatenate([solution.chain.ravel(), solution.calib])
@@ -108,6 +112,12 @@ def test_solution_is_the_dense_one_however_images_hang_on_keyframes(per_keyframe
     check(*build(13, 30, 2, per_keyframe=per_keyframe, by_next=by_next, sizes=sizes), 13)
 
 
+@each("by_next", [False, True])
+def test_solution_is_the_dense_one_with_more_imus(by_next):
+    """Keyframes of 33 dimensions, as those of three IMUs."""
+    check(*build(9, 30, 3, by_next=by_next, dim=KEYFRAME_DIM + 18), 9)
+
+
 def test_marginalise_takes_features_out():
     (piece,), H, g = build(6, 5, 4, pieces=(Piece.zeros(0, 5, 4),))
     o = KEYFRAME_DIM * 6
@@ -125,7 +135,7 @@ def by_step(lists, n):
 def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_last():
     track, keyframe = np.array([0, 0, 1, 1, 2, 3, 3]), np.array([1, 6, 2, 4, 7, 0, 2])
     for forwards in (True, False):
-        order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), 2), 8, forwards, False, sizes=(2,))
+        order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), (15, 3)), 8, forwards, False, sizes=(2,))
         assert by_step(order.keyframes, 4) == (
             [[0, 1], [2, 3], [4, 5], [6, 7]] if forwards else [[7, 6], [5, 4], [3, 2], [1, 0]]
         )
@@ -133,7 +143,7 @@ def test_features_are_in_the_front_from_the_first_group_that_sees_them_to_the_la
         assert by_step(order.born, 4) == ([[0, 3], [1], [], []] if forwards else [[0], [1], [3], []])
         assert order.alive.tolist() == ([2, 3, 2, 1] if forwards else [1, 2, 3, 2])
     # Forwards, feature 3 leaves slot 1 in the second step, and 1 moves there from slot 2 in the third.
-    order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), 2), 8, True, False, sizes=(2,))
+    order = plan(FeatureSums.zeros(4, track, keyframe, np.arange(8), (15, 3)), 8, True, False, sizes=(2,))
     assert by_step(order.dying, 4) == [[], [1], [1], [0]]
     assert by_step(order.leave, 4) == [[], [], [2], []]
     assert order.enter.tolist() == [1]
@@ -145,12 +155,16 @@ def test_the_size_of_groups_is_chosen_by_cost():
     image = np.repeat(np.arange(n), per_keyframe)
     ends = np.arange(0, n, 24)
     sums = FeatureSums.zeros(
-        len(image) // 24, image // 24 * per_keyframe + np.arange(len(image)) % per_keyframe, image, np.arange(n), 40
+        len(image) // 24,
+        image // 24 * per_keyframe + np.arange(len(image)) % per_keyframe,
+        image,
+        np.arange(n),
+        (15, 41),
     )
     short = plan(sums, n, True, False, ends)
     assert np.diff(short.keyframes.start).tolist() == [24] * 8
     assert short.alive.max() == 0 and len(short.local.values) == len(sums.diagonal)
-    lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), 40)
+    lasting = FeatureSums.zeros(200, np.tile(np.arange(200), 2), np.repeat([0, n - 1], 200), np.arange(n), (15, 41))
     assert np.diff(plan(lasting, n, True, False).keyframes.start).max() < 24
 
 

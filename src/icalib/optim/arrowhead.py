@@ -1,7 +1,7 @@
 """Normal equations of a chain of keyframes with dense calibration parameters: an arrowhead matrix, solved in time
 linear in the length of the chain.
 
-    [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, 15 x 15 blocks
+    [ T   E ] [chain ]     [g_chain ]      T: block tridiagonal, D x D blocks, D = 15 with one IMU
     [ E^T C ] [calib ] = - [g_calib ]      E: chain x calib, C: calib x calib
 
 The chain is cut into pieces that share their end keyframes. Each piece is accumulated and eliminated by its own thread,
@@ -159,7 +159,7 @@ class Sums(NamedTuple):
 class Piece:
     """J^T J and J^T r of the factors between keyframes `first` and `last`, both included; n = last - first + 1.
 
-    diagonal (n, 15, 15); upper (n, 15, 15), keyframe k with k + 1; side (n, 15, B + 1), keyframe with calibration
+    diagonal (n, D, D); upper (n, D, D), keyframe k with k + 1; side (n, D, B + 1), keyframe with calibration
     parameters, and its gradient in the last column; calib (B + 1, B + 1), the calibration parameters and their gradient
     in the last column. features: feature tracks seen from these keyframes only, which are eliminated with them; None
     without any.
@@ -174,17 +174,22 @@ class Piece:
     features: PieceFeatures | None = None
 
     @classmethod
-    def zeros(cls, first: int, last: int, n_calib: int) -> Piece:
-        """A piece with all sums zero, for B = `n_calib` calibration parameters."""
+    def zeros(cls, first: int, last: int, n_calib: int, dim: int = KEYFRAME_DIM) -> Piece:
+        """A piece with all sums zero, for B = `n_calib` calibration parameters and keyframes of `dim` dimensions."""
         n = last - first + 1
         return cls(
             first,
             last,
-            memory.mmap_zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
-            memory.mmap_zeros((n, KEYFRAME_DIM, KEYFRAME_DIM)),
-            memory.mmap_zeros((n, KEYFRAME_DIM, n_calib + 1)),
+            memory.mmap_zeros((n, dim, dim)),
+            memory.mmap_zeros((n, dim, dim)),
+            memory.mmap_zeros((n, dim, n_calib + 1)),
             np.zeros((n_calib + 1, n_calib + 1)),
         )
+
+    @property
+    def dim(self) -> int:
+        """D, the dimensions of a keyframe."""
+        return self.side.shape[1]
 
     @classmethod
     def bare(cls, first: int, last: int) -> Piece:
@@ -219,18 +224,18 @@ def chain_cuts(n_keyframes: int) -> tuple[int, ...]:
     return () if middle < 2 else (middle,)
 
 
-def make_pieces(n_keyframes: int, n_calib: int | None) -> tuple[Piece, ...]:
+def make_pieces(n_keyframes: int, n_calib: int | None, dim: int = KEYFRAME_DIM) -> tuple[Piece, ...]:
     """Two pieces of about equal length, or one if the chain is too short. `n_calib` None: pieces for residuals
     alone."""
     ends = (0, *chain_cuts(n_keyframes), n_keyframes - 1)
     if n_calib is not None:
         memory.trim_heap()  # memory peaks here
-    return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib) for a, b in pairwise(ends))
+    return tuple(Piece.bare(a, b) if n_calib is None else Piece.zeros(a, b, n_calib, dim) for a, b in pairwise(ends))
 
 
 @dataclass(frozen=True)
 class Draw:
-    """A draw from the posterior, as a step: chain (K, 15), calib (B,)."""
+    """A draw from the posterior, as a step: chain (K, D), calib (B,)."""
 
     chain: np.ndarray
     calib: np.ndarray
@@ -240,7 +245,7 @@ class Draw:
 class Factors:
     """Cholesky factors of the block elimination, for back substitution and sampling.
 
-    pieces: overwritten by their factors; eliminations: per piece, see `_reduce`. shared (15, 15), shared_side (15, B +
+    pieces: overwritten by their factors; eliminations: per piece, see `_reduce`. shared (D, D), shared_side (D, B +
     1): factors of the shared keyframe, empty without one. information (B, B): of the calibration parameters, chain
     marginalised. tolerance, fixed_directions, essential: see `calib_step`.
     """
@@ -256,13 +261,13 @@ class Factors:
     essential: np.ndarray | None = None
 
     def back(self, calib: np.ndarray, white: list[np.ndarray]) -> np.ndarray:
-        """Back substitution of m right-hand sides: steps (K, 15, m) of the keyframes.
+        """Back substitution of m right-hand sides: steps (K, D, m) of the keyframes.
 
         calib (B + 1, m): steps of the calibration parameters; last row: factor of the gradient (1 solves, 0 samples).
         white: further right-hand sides after forward substitution, per piece, then of the shared keyframe.
         """
         m = calib.shape[1]
-        chain = np.zeros((self.n_keyframes, KEYFRAME_DIM, m))
+        chain = np.zeros((self.n_keyframes, self.pieces[0].dim, m))
         if len(self.shared):
             chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ calib)
         keep = len(self.shared) > 0
@@ -287,7 +292,7 @@ class Factors:
 
 @dataclass(frozen=True)
 class Solution:
-    """Step (chain (K, 15), calib (B,)), predicted decrease of half the chi^2, and the Cholesky factors.
+    """Step (chain (K, D), calib (B,)), predicted decrease of half the chi^2, and the Cholesky factors.
 
     gradient (B + 1,): of the calibration parameters, chain marginalised; last element: minus twice the decrease of half
     the chi^2 by the chain alone.
@@ -358,12 +363,13 @@ def _reduce(piece: Piece, keep: bool) -> Eliminated | bool:
     if elimination is None:
         return False
     remaining = np.triu(elimination.remaining) + np.triu(elimination.remaining, 1).T
-    kept = KEYFRAME_DIM if keep else 0
+    dim = piece.dim
+    kept = dim if keep else 0
     piece.calib += remaining[kept:, kept:]
     if keep:
         end = -1 if forwards else 0
-        piece.diagonal[end] += remaining[:KEYFRAME_DIM, :KEYFRAME_DIM]
-        piece.side[end] += remaining[:KEYFRAME_DIM, KEYFRAME_DIM:]
+        piece.diagonal[end] += remaining[:dim, :dim]
+        piece.side[end] += remaining[:dim, dim:]
     return elimination
 
 
@@ -377,7 +383,7 @@ def _reduce_all(piece: Piece) -> Eliminated | bool:
 
 def _unknowns(piece: Piece, elimination: Eliminated | bool) -> int:
     """Number of eliminated unknowns of a piece; without features, a kept end keyframe counts too."""
-    return elimination.rows if isinstance(elimination, Eliminated) else len(piece.diagonal) * KEYFRAME_DIM
+    return elimination.rows if isinstance(elimination, Eliminated) else len(piece.diagonal) * piece.dim
 
 
 def marginalise(piece: Piece) -> np.ndarray:
@@ -388,10 +394,10 @@ def marginalise(piece: Piece) -> np.ndarray:
 
 
 def chain_step_given_calib(piece: Piece, calib: np.ndarray) -> np.ndarray:
-    """Optimal steps (n, 15, m) of the keyframes of `piece` for given steps (B, m) of the calibration parameters;
+    """Optimal steps (n, D, m) of the keyframes of `piece` for given steps (B, m) of the calibration parameters;
     overwrites the piece. Raises NotDefiniteError."""
     elimination, m = _reduce_all(piece), calib.shape[1]
-    chain = np.zeros((piece.last + 1, KEYFRAME_DIM, m))
+    chain = np.zeros((piece.last + 1, piece.dim, m))
     _back(
         piece,
         elimination,
@@ -423,7 +429,7 @@ def _onto_last(piece: Piece) -> Piece:
     NotDefiniteError."""
     if not eliminate_chain(piece.diagonal, piece.upper, piece.side, True, True):
         raise NotDefiniteError(NOT_DEFINITE)
-    last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1)
+    last = Piece.zeros(piece.last, piece.last, piece.side.shape[2] - 1, piece.dim)
     last.diagonal[0], last.side[0] = piece.diagonal[-1], piece.side[-1]
     flat = piece.side[:-1].reshape(-1, piece.side.shape[2])
     last.calib[:] = piece.calib - flat.T @ flat
@@ -433,7 +439,7 @@ def _onto_last(piece: Piece) -> Piece:
 def _back(
     piece: Piece, elimination: Eliminated | bool, white: np.ndarray, keep: bool, calib: np.ndarray, chain: np.ndarray
 ) -> None:
-    """Back substitution of one piece: fills its part of `chain` (K, 15, m), from `calib` and the kept keyframe; see
+    """Back substitution of one piece: fills its part of `chain` (K, D, m), from `calib` and the kept keyframe; see
     `Factors.back`."""
     steps = chain[piece.first : piece.last + 1]
     if isinstance(elimination, Eliminated):
@@ -441,7 +447,7 @@ def _back(
         return
     for k in range(calib.shape[1]):
         step, calib_k = np.ascontiguousarray(steps[:, :, k]), np.ascontiguousarray(calib[:, k])
-        noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, KEYFRAME_DIM), piece.first == 0 or not keep
+        noise, forwards = np.ascontiguousarray(white[:, k]).reshape(-1, piece.dim), piece.first == 0 or not keep
         substitute_chain(piece.diagonal, piece.upper, piece.side, forwards, keep, calib_k, noise, step)
         # The shared keyframe is an input; each piece writes only its own keyframes.
         inner = slice(None) if not keep else slice(None, -1) if piece.first == 0 else slice(1, None)
@@ -552,11 +558,11 @@ def eliminate_chain(diagonal, upper, side, forwards, keep):
 
 @njit(cache=True, nogil=True)
 def substitute_chain(diagonal, upper, side, forwards, keep, calib, white, chain):
-    """Back substitution with the factors of `eliminate_chain`: fills chain (n, 15). With `keep` the final keyframe's
+    """Back substitution with the factors of `eliminate_chain`: fills chain (n, D). With `keep` the final keyframe's
     step is an input.
 
     calib (B + 1,): step of the calibration parameters, and the factor of the gradient (1 solves, 0 samples). white (n,
-    15): further right-hand side after forward substitution.
+    D): further right-hand side after forward substitution.
     """
     n = diagonal.shape[0]
     for step in range(n - 2 if keep else n - 1, -1, -1):

@@ -15,7 +15,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry.blas import solve_upper
 from icalib.optim.front_kernels import FrontChain, Sizes, eliminate_all, rotate_keyframes, step_factors
-from icalib.optim.state import KEYFRAME_DIM, POSE_DIM
+from icalib.optim.state import POSE_DIM
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class PieceFeatures:
     @classmethod
     def of(cls, sums: FeatureSums, plan: Plan) -> PieceFeatures:
         """The features with a new workspace."""
-        return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2]).start[-1]))
+        return cls(sums, plan, np.empty(_sizes(plan, sums.side.shape[2], sums.dim).start[-1]))
 
     def widened(self, n_calib: int) -> PieceFeatures:
         """The same features with more calibration columns, `n_calib` in all. New columns and the gradient are zero."""
@@ -43,8 +43,8 @@ class PieceFeatures:
 
 @dataclass(frozen=True)
 class Eliminated:
-    """Result of the elimination: plan and sizes; turn (n, 15, 15), the orthogonal transform of each keyframe;
-    workspace: holds the factors of all steps; remaining (15 or 0 + B + 1, same), upper triangle: the system of the kept
+    """Result of the elimination: plan and sizes; turn (n, D, D), the orthogonal transform of each keyframe;
+    workspace: holds the factors of all steps; remaining (D or 0 + B + 1, same), upper triangle: the system of the kept
     keyframe, calibration parameters and gradient."""
 
     plan: Plan
@@ -59,7 +59,7 @@ class Eliminated:
         return int(self.sizes.uncoupled.sum() + self.sizes.coupled.sum() + self.sizes.dying.sum())
 
     def substitute(self, calib: np.ndarray, white: np.ndarray, chain: np.ndarray) -> None:
-        """Back substitution of m right-hand sides: fills chain (n, 15, m), whose kept keyframe is an input.
+        """Back substitution of m right-hand sides: fills chain (n, D, m), whose kept keyframe is an input.
 
         calib (B + 1, m): steps of the calibration parameters, and in the last row the factor of the gradient. white
         (rows, m): further right-hand sides after forward substitution.
@@ -67,15 +67,15 @@ class Eliminated:
         substitute_all(self.plan, self.sizes, self.turn, self.workspace, calib, white, chain)
 
 
-def _sizes(plan: Plan, n_calib: int) -> Sizes:
+def _sizes(plan: Plan, n_calib: int, dim: int) -> Sizes:
     """Numbers of rows and columns that the factors of every step have, see `Sizes`, and where they start in the
     workspace. The shapes are those in `step_factors`."""
     coupled = np.add.reduceat(np.append(plan.coupled[plan.keyframes.values], 0), plan.keyframes.start[:-1])
     counts = np.diff(plan.keyframes.start)
     coupled[counts == 0] = 0
-    uncoupled, dying, wide = KEYFRAME_DIM * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
-    lengths = (uncoupled + coupled) ** 2 + dying * (dying + coupled) + uncoupled * (KEYFRAME_DIM + n_calib)
-    lengths += (coupled + dying) * (KEYFRAME_DIM + wide)
+    uncoupled, dying, wide = dim * counts - coupled, 3 * np.diff(plan.dying.start), n_calib + 3 * plan.alive
+    lengths = (uncoupled + coupled) ** 2 + dying * (dying + coupled) + uncoupled * (dim + n_calib)
+    lengths += (coupled + dying) * (dim + wide)
     return Sizes(uncoupled, coupled, dying, wide, np.concatenate([[0], np.cumsum(lengths)]))
 
 
@@ -84,20 +84,20 @@ def eliminate(
 ) -> Eliminated | None:
     """Eliminates all keyframes and features of a piece, but for a kept end keyframe; None if the sums are not positive
     definite. The factors are in the workspace of `features`."""
-    plan, sums, n_calib = features.plan, features.sums, side.shape[2]
-    sizes = _sizes(plan, n_calib)
+    plan, sums, dim, n_calib = features.plan, features.sums, *side.shape[1:]
+    sizes = _sizes(plan, n_calib, dim)
     widest = int(sizes.wide.max())
     turn, workspace = np.empty_like(diagonal), features.workspace
     chain = FrontChain(diagonal, upper, side, forwards, turn, np.empty_like(sums.pose), np.empty_like(sums.next_pose))
     rotate_keyframes(plan, sums, turn, chain.pose, chain.next_pose)
-    front, carry = np.zeros((widest, widest)), np.zeros((KEYFRAME_DIM, KEYFRAME_DIM + widest))
+    front, carry = np.zeros((widest, widest)), np.zeros((dim, dim + widest))
     if not eliminate_all(plan, sizes, sums, chain, workspace, front, carry):
         return None
     if not keep:
         return Eliminated(plan, sizes, turn, workspace, front[:n_calib, :n_calib].copy())
-    remaining = np.zeros((KEYFRAME_DIM + n_calib, KEYFRAME_DIM + n_calib))
-    remaining[:KEYFRAME_DIM], remaining[KEYFRAME_DIM:, KEYFRAME_DIM:] = (
-        carry[:, : KEYFRAME_DIM + n_calib],
+    remaining = np.zeros((dim + n_calib, dim + n_calib))
+    remaining[:dim], remaining[dim:, dim:] = (
+        carry[:, : dim + n_calib],
         front[:n_calib, :n_calib],
     )
     return Eliminated(plan, sizes, turn, workspace, remaining)
@@ -124,7 +124,7 @@ class FeatureSums(NamedTuple):
     calibration parameters, its gradient in the last column; block (E, 3, 6), feature with the camera's pose, for each
     pair of feature and image.
 
-    pose (I, 6, 15), Jacobian of a camera's pose by the keyframe of its image; next_pose (I or 0, 6, 15), by the next
+    pose (I, 6, D), Jacobian of a camera's pose by the keyframe of its image; next_pose (I or 0, 6, D), by the next
     keyframe. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
     """
 
@@ -144,14 +144,15 @@ class FeatureSums(NamedTuple):
         track: np.ndarray,
         image: np.ndarray,
         keyframe: np.ndarray,
-        n_calib: int,
+        shape: tuple[int, ...],
         by_next: bool = False,
     ) -> FeatureSums:
-        """Sums of `n_tracks` features, all zero. by_next: whether poses also depend on the next keyframe."""
-        pose = np.zeros((len(keyframe), POSE_DIM, KEYFRAME_DIM))
+        """Sums of `n_tracks` features, all zero. shape: (D, B + 1). by_next: whether poses also depend on the next
+        keyframe."""
+        pose = np.zeros((len(keyframe), POSE_DIM, shape[0]))
         return cls(
             np.zeros((n_tracks, 3, 3)),
-            np.zeros((n_tracks, 3, n_calib + 1)),
+            np.zeros((n_tracks, 3, shape[1])),
             np.zeros((len(track), 3, POSE_DIM)),
             pose,
             pose.copy() if by_next else pose[:0],
@@ -159,6 +160,11 @@ class FeatureSums(NamedTuple):
             image,
             keyframe,
         )
+
+    @property
+    def dim(self) -> int:
+        """D, the dimensions of a keyframe."""
+        return self.pose.shape[2]
 
     def clear(self) -> None:
         """Sets the terms of features to zero; the Jacobians of poses stay."""
@@ -246,14 +252,14 @@ class _Lives:
         local = (first == last) & (first != without_keyframes) & (len(sums.next_pose) == 0)
         return cls(groups, step, first, last, local)
 
-    def cost(self, coupled: np.ndarray, n_calib: int) -> float:
+    def cost(self, coupled: np.ndarray, dim: int, n_calib: int) -> float:
         """Cost of an elimination in multiplications, including memory traffic."""
         n, lasting = len(self.groups), ~self.local & (self.last >= 0)
         born = np.bincount(self.first[lasting], minlength=n)[:n]
         died = np.bincount(self.last[lasting], minlength=n)[:n]
         wide = n_calib + 3.0 * (np.cumsum(born) - np.cumsum(died) + died)
-        keyframes = KEYFRAME_DIM * np.array([len(g) for g in self.groups])
-        meets = np.array([coupled[g].sum() + (KEYFRAME_DIM - coupled[g[:1]]).sum() for g in self.groups])
+        keyframes = dim * np.array([len(g) for g in self.groups])
+        meets = np.array([coupled[g].sum() + (dim - coupled[g[:1]]).sum() for g in self.groups])
         rank = meets + 3.0 * died
         small = keyframes**3 / 6.0 + keyframes**2 * n_calib / 2.0 + wide * rank**2 / 2.0
         moved = FRONT_MOVE_COST * wide**2 + FACTOR_MOVE_COST * (rank * wide + keyframes**2)
@@ -272,9 +278,9 @@ def plan(
     direction. ends: keyframes before which all features end; sizes: group sizes, of which the cheapest is taken."""
     n_dims = np.zeros(n_keyframes, dtype=np.int64)
     np.add.at(n_dims, sums.keyframe[np.unique(sums.image)], POSE_DIM)
-    coupled = np.minimum(n_dims, KEYFRAME_DIM) if not len(sums.next_pose) else np.full(n_keyframes, KEYFRAME_DIM)
+    coupled = np.minimum(n_dims, sums.dim) if not len(sums.next_pose) else np.full(n_keyframes, sums.dim)
     candidates = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
-    lives = min(candidates, key=lambda x: x.cost(coupled, sums.side.shape[2]))
+    lives = min(candidates, key=lambda x: x.cost(coupled, sums.dim, sums.side.shape[2]))
     return _steps(sums, lives, coupled, n_keyframes, forwards)
 
 
@@ -286,8 +292,8 @@ def _steps(sums: FeatureSums, lives: _Lives, coupled: np.ndarray, n_keyframes: i
     after = np.append(order, -1)[np.minimum(ends, n_keyframes)]
     coupled_dims = coupled.copy()
     for group in groups:
-        coupled_dims[group[:1]] = KEYFRAME_DIM  # the step before coupled all of its dimensions
-    coupled_dims[after[after >= 0]] = KEYFRAME_DIM
+        coupled_dims[group[:1]] = sums.dim  # the step before coupled all of its dimensions
+    coupled_dims[after[after >= 0]] = sums.dim
     tracks, in_front = np.arange(len(sums.diagonal)), ~lives.local
     slots = _slots(lives, n)
     step = np.where(in_front[sums.track], lives.step[sums.image], -1)
@@ -375,41 +381,40 @@ def _solve_columns(U, X):
 
 @njit(cache=True, nogil=True)
 def substitute_all(plan, sizes, turn, workspace, calib, white, chain):
-    """Back substitution: fills chain (n, 15, m), whose kept keyframe is an input.
+    """Back substitution: fills chain (n, D, m), whose kept keyframe is an input.
 
     calib (B + 1, m): steps of the calibration parameters; last row: factor of the gradient. white (rows, m): further
     right-hand sides after forward substitution, by step: uncoupled, coupled, dying.
     """
-    n_b, m, end = len(calib), calib.shape[1], len(white)
-    solved = np.zeros((KEYFRAME_DIM + sizes.wide.max(), m))
-    solved[KEYFRAME_DIM : KEYFRAME_DIM + n_b] = calib
+    n_b, dim, m, end = len(calib), chain.shape[1], calib.shape[1], len(white)
+    solved = np.zeros((dim + sizes.wide.max(), m))
+    solved[dim : dim + n_b] = calib
     for g in range(len(plan.after) - 1, -1, -1):
         a, c = sizes.uncoupled[g], sizes.coupled[g]
-        U, Ud, D, Wr, Wc = step_factors(g, sizes, n_b, workspace)
+        U, Ud, D, Wr, Wc = step_factors(g, sizes, dim, n_b, workspace)
         begin = end - a - len(Wc)
-        solved[:KEYFRAME_DIM] = 0.0
+        solved[:dim] = 0.0
         if plan.after[g] >= 0:
-            solved[:KEYFRAME_DIM] = chain[plan.after[g]]
+            solved[:dim] = chain[plan.after[g]]
         x = white[begin + a : end] - Wc @ solved[: Wc.shape[1]]
         _solve_columns(Ud, x[c:])
         z = np.empty((a + c, m))
         z[a:] = x[:c] - D @ x[c:]
         _solve_columns(U[a:, a:], z[a:])
-        z[:a] = white[begin : begin + a] - Wr @ solved[: KEYFRAME_DIM + n_b]
+        z[:a] = white[begin : begin + a] - Wr @ solved[: dim + n_b]
         for i in range(a):
             for j in range(a, a + c):
                 for k in range(m):
                     z[i, k] -= U[i, j] * z[j, k]
         _solve_columns(U[:a, :a], z[:a])
-        _take_back(g, plan, n_b, x[c:], solved)
+        _take_back(g, plan, dim + n_b, x[c:], solved)
         _turn_back(g, plan, a, turn, z, chain)
         end = begin
 
 
 @njit(cache=True, nogil=True)
-def _take_back(g, plan, n_b, dying, solved):
-    """Restores features to their slots before the step, in `solved`."""
-    o = KEYFRAME_DIM + n_b
+def _take_back(g, plan, o, dying, solved):
+    """Restores features to their slots before the step, in `solved`, where they start at row `o`."""
     for q in range(plan.dying.start[g], plan.dying.start[g + 1]):
         at, x = o + 3 * plan.dying.values[q], 3 * (q - plan.dying.start[g])
         solved[at : at + 3] = dying[x : x + 3]
@@ -421,10 +426,11 @@ def _take_back(g, plan, n_b, dying, solved):
 @njit(cache=True, nogil=True)
 def _turn_back(g, plan, uncoupled, turn, z, chain):
     """Fills the steps of the keyframes, rotated back to their own dimensions."""
-    r, c, x = 0, uncoupled, np.empty((KEYFRAME_DIM, z.shape[1]))
+    r, c, dim = 0, uncoupled, chain.shape[1]
+    x = np.empty((dim, z.shape[1]))
     for q in range(plan.keyframes.start[g], plan.keyframes.start[g + 1]):
         k = plan.keyframes.values[q]
         n = plan.coupled[k]
-        x[:n], x[n:] = z[c : c + n], z[r : r + KEYFRAME_DIM - n]
-        c, r = c + n, r + KEYFRAME_DIM - n
+        x[:n], x[n:] = z[c : c + n], z[r : r + dim - n]
+        c, r = c + n, r + dim - n
         chain[k] = turn[k] @ x

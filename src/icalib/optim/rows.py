@@ -55,16 +55,18 @@ class Rows(NamedTuple):
 def add_product(k, n_chain, width, A, B, columns, sums):
     """Adds A^T B to the sums of keyframe k of the piece, of the next one, and of the calibration parameters.
 
-    The first `width` columns of A are by keyframe k, by the next one if n_chain is 30 and not 15, then by calibration
-    parameters. B (m, n_chain + c + 1) has the same columns, possibly more calibration parameters, and the residual.
-    columns (c,): calibration columns of B, -1 where fixed, all different.
+    The first `width` columns of A are by keyframe k, by the next one unless n_chain is 15, then by calibration
+    parameters. n_chain is 30, or twice the dimensions of a keyframe; other rows do not depend on any but the first 15.
+    B (m, n_chain + c + 1) has the same columns, possibly more calibration parameters, and the residual. columns (c,):
+    calibration columns of B, -1 where fixed, all different.
 
     Indices are unsigned. A signed index may be negative, and the wrap-around check would keep the compiler from
     vectorising.
     """
     diagonal, upper, side = sums.diagonal, sums.upper, sums.side
-    n, end, n_b, block = UInt(n_chain), UInt(len(columns)), UInt(sums.calib.shape[0] - 1), UInt(KEYFRAME_DIM)
-    row, calib_row = np.empty(KEYFRAME_PAIR_DIM), np.empty(len(columns) + 1)
+    n, end, n_b = UInt(n_chain), UInt(len(columns)), UInt(sums.calib.shape[0] - 1)
+    block = n if n_chain == KEYFRAME_DIM else UInt(n_chain // 2)
+    row, calib_row = np.empty(2 * block), np.empty(len(columns) + 1)
     for i in range(n):
         is_next = i >= block
         keyframe, r, column = (UInt(k + 1), i - block, block) if is_next else (UInt(k), i, UInt(0))
@@ -92,9 +94,9 @@ def add_product(k, n_chain, width, A, B, columns, sums):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_to_row(i, n, end, column, has_next, A, B, row, calib_row):
-    """Adds row i of A^T B to `row` (30,): 15 columns of B from `column` on, and those of the next keyframe if
-    `has_next`; and to `calib_row` (end + 1,): the columns of B from n on."""
-    block = UInt(KEYFRAME_DIM)
+    """Adds row i of A^T B to `row`, of two keyframes: the columns of B from `column` on, and those of the next keyframe
+    if `has_next`; and to `calib_row` (end + 1,): the columns of B from n on."""
+    block = UInt(len(row) // 2)
     for q in range(UInt(len(A))):
         f = A[q, i]
         if f == 0.0:
@@ -229,7 +231,7 @@ def accumulate_rows(rows, keyframe, W, loss, columns, sums, residual, root):
             for j in range(width):
                 whitened[q, j] *= scaled[0, q]
             whitened[q, width] = scaled[1, q] * residual[i, q]
-        add_product(keyframe[i] - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
+        add_product(keyframe[i] - sums.first, width - len(columns), width, whitened, whitened, columns, sums)
     return cost
 
 

@@ -1,11 +1,13 @@
 """Estimated quantities: inertial states at the keyframes, and the calibration parameters.
 
-A keyframe is (R_world_imu, p, v, b_g, b_a): 15 tangent dimensions in this order (iCalib paper (2)).
+A keyframe is (R_world_imu, p, v, b_g, b_a): 15 tangent dimensions in this order (iCalib paper (2)). Each further IMU
+adds nine: its velocity relative to the first IMU, and its biases.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
@@ -14,7 +16,8 @@ import numpy as np
 from icalib.geometry import planes, so3
 from icalib.geometry.planes import tangents
 
-KEYFRAME_DIM = 15  # tangent dimensions of a keyframe
+KEYFRAME_DIM = 15  # tangent dimensions of a keyframe with one IMU
+FURTHER_IMU_DIM = 9  # those that each further IMU adds
 POSE_DIM = 6  # of these, rotation and position
 Key = tuple[str, str]  # sensor (or body, plane, frame), name of the parameter
 Kind = Literal["vector", "nuisance", "rotation", "tilt", "plane"]
@@ -59,14 +62,23 @@ class Block:
 
 @dataclass(frozen=True)
 class Layout:
-    """Order of the calibration parameters, and their columns in the normal equations."""
+    """Order of the calibration parameters, and their columns in the normal equations. further_imus: names of the IMUs
+    after the first, in the order of their states in a keyframe. shows_places: whether any measurement depends on the
+    place of the body, so that its path is more than dead reckoning."""
 
     blocks: tuple[Block, ...]
+    further_imus: tuple[str, ...] = ()
+    shows_places: bool = True
 
     @property
     def size(self) -> int:
         """B, the number of calibration columns."""
         return sum(b.size for b in self.blocks if b.start is not None)
+
+    @property
+    def keyframe_dim(self) -> int:
+        """D, the tangent dimensions of a keyframe."""
+        return KEYFRAME_DIM + FURTHER_IMU_DIM * len(self.further_imus)
 
     @property
     def free(self) -> tuple[Block, ...]:
@@ -95,13 +107,14 @@ class Layout:
         return np.concatenate([self.block(sensor, n).columns for n in names])
 
 
-def make_layout(entries: list[Entry]) -> Layout:
-    """Layout of the entries in their order; estimated ones get consecutive calibration columns."""
+def make_layout(entries: list[Entry], further_imus: Sequence[str] = ()) -> Layout:
+    """Layout of the entries in their order; estimated ones get consecutive calibration columns. further_imus: see
+    `Layout`."""
     blocks, column = [], 0
     for sensor, name, kind, size, estimated in entries:
         blocks.append(Block(sensor, name, kind, size, column if estimated else None))
         column += size if estimated else 0
-    return Layout(tuple(blocks))
+    return Layout(tuple(blocks), tuple(further_imus))
 
 
 # Weight of the first keyframe's rotation against planes (weight 1) or positions (1 m^2): decides only where these are
@@ -115,6 +128,8 @@ class State:
     world frame z up.
 
     starts: first keyframe of each recording. Each recording has its own world frame, whose origin is the target's.
+    further_imus (K, 9 n), for each of n IMUs after the first: its velocity relative to the first IMU, in the axes of
+    the first [m/s], and its biases as in `bias`.
     """
 
     seconds: np.ndarray
@@ -124,6 +139,11 @@ class State:
     bias: np.ndarray  # (K, 6) gyroscope [rad/s], accelerometer [m/s^2]
     values: dict[Key, np.ndarray]
     starts: tuple[int, ...] = (0,)
+    further_imus: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def __post_init__(self) -> None:
+        if not self.further_imus.size:
+            object.__setattr__(self, "further_imus", np.zeros((len(self.seconds), 0)))
 
     @property
     def recording(self) -> np.ndarray:
@@ -136,7 +156,7 @@ class State:
         return [slice(a, b) for a, b in pairwise((*self.starts, len(self.seconds)))]
 
     def retract(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> State:
-        """The state moved by tangent steps chain (K, 15) and calib (B,).
+        """The state moved by tangent steps chain (K, D) and calib (B,).
 
         A tilt of the target rotates the trajectory of its recording with it, exactly. Steps of the keyframes are
         relative to this rotation, and are rotated too. To first order this equals the plain retraction. If gravity is
@@ -155,15 +175,19 @@ class State:
             R[k] = Q @ self.rotation[k] @ so3.exp_many(d_rotation)
             p[k] = (self.position[k] + d_position) @ Q.T
             v[k] = (self.velocity[k] + d_velocity) @ Q.T
-        return replace(self, rotation=R, position=p, velocity=v, bias=self.bias + chain[:, 9:15], values=values)
+        moved = replace(self, rotation=R, position=p, velocity=v, values=values)
+        further = self.further_imus + chain[:, KEYFRAME_DIM:]
+        return replace(moved, bias=self.bias + chain[:, 9:KEYFRAME_DIM], further_imus=further)
 
     def _turns(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> list[np.ndarray]:
         """Rotation vector (3,) of each recording's world in world axes [rad]. Zero for several recordings without a
-        target, which share planes."""
+        target, which share planes, and where nothing shows places."""
         tilts = [np.append(calib[b.columns], 0.0) for b in layout.free if b.kind == "tilt"]
         if tilts:
             return tilts
-        return [self._common_turn(layout, chain, calib)] if len(self.starts) == 1 else [np.zeros(3)] * len(self.starts)
+        if len(self.starts) == 1 and layout.shows_places:
+            return [self._common_turn(layout, chain, calib)]
+        return [np.zeros(3)] * len(self.starts)
 
     def _common_turn(self, layout: Layout, chain: np.ndarray, calib: np.ndarray) -> np.ndarray:
         """Rotation vector (3,) [rad, world axes] common to all planes in this step, by least squares; without planes,

@@ -228,7 +228,7 @@ class FeatureFactor(FactorDefaults):
         by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
         sums = FeatureSums.zeros(
             tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, keyframe - piece.first,
-            piece.calib.shape[0] - 1, by_next,
+            piece.side.shape[1:], by_next,
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
         steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)

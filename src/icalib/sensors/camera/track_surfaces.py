@@ -24,7 +24,7 @@ from icalib.geometry.small import solve_definite
 from icalib.optim.arrowhead import Piece
 from icalib.optim.front import FeatureSums
 from icalib.optim.rows import Loss, weight
-from icalib.optim.state import Key, Planes
+from icalib.optim.state import KEYFRAME_DIM, Key, Planes
 from icalib.sensors.camera.track_kernels import in_camera
 
 ON_PLANES = "points on planes"  # kind of residual
@@ -61,7 +61,9 @@ class OnPlanes(NamedTuple):
 
 NO_PLANES = OnPlanes.none(0)
 NO_NUMBERS = np.zeros(0, dtype=np.int64)
-NO_SUMS = FeatureSums.zeros(0, NO_NUMBERS, NO_NUMBERS, NO_NUMBERS, 0)  # of passes without normal equations
+NO_SUMS = FeatureSums.zeros(
+    0, NO_NUMBERS, NO_NUMBERS, NO_NUMBERS, (KEYFRAME_DIM, 1)
+)  # of passes without normal equations
 
 
 class PlaneDistances(NamedTuple):
