@@ -128,11 +128,12 @@ class Setup:
         """(B,) a reasonable step of each calibration column."""
         scale = np.zeros(self.layout.size)
         for b in self.layout.free:
-            scale[b.columns] = 1e-3 if b.key == ("imu0", "intrinsics") else TOLERANCE[b.name]
+            scale[b.columns] = 1e-3 if b.name == "intrinsics" and b.size == 24 else TOLERANCE[b.name]
         return scale
 
     def perturbed(self, rng: np.random.Generator, size: float = 1.0) -> State:
-        chain = rng.normal(size=(len(self.state.seconds), KEYFRAME_DIM)) * np.repeat([2e-3, 2e-3, 5e-3, 5e-4, 5e-3], 3)
+        one = [2e-3, 2e-3, 5e-3, 5e-4, 5e-3] + [5e-3, 5e-4, 5e-3] * len(self.layout.further_imus)
+        chain = rng.normal(size=(len(self.state.seconds), 3 * len(one))) * np.repeat(one, 3)
         return self.state.retract(
             self.layout, size * chain, size * rng.normal(size=self.layout.size) * self.columns_scale()
         )
@@ -367,16 +368,17 @@ def room_scenario(duration_s: float, *, example: str = "table2-3d", noiseless: b
 def make_dense(pieces: tuple[Piece, ...], n_keyframes: int) -> tuple[np.ndarray, np.ndarray]:
     """The normal matrix (chain, then calib) and its gradient."""
     n_calib = pieces[0].calib.shape[0] - 1
-    o = KEYFRAME_DIM * n_keyframes
+    dim = pieces[0].dim
+    o = dim * n_keyframes
     H, g = np.zeros((o + n_calib, o + n_calib)), np.zeros(o + n_calib)
     for piece in pieces:
         for k in range(piece.first, piece.last + 1):
-            i, a = k - piece.first, slice(KEYFRAME_DIM * k, KEYFRAME_DIM * k + KEYFRAME_DIM)
+            i, a = k - piece.first, slice(dim * k, dim * k + dim)
             H[a, a] += piece.diagonal[i]
             H[a, o:] += piece.side[i, :, :-1]
             g[a] += piece.side[i, :, -1]
             if k < piece.last:
-                H[a, KEYFRAME_DIM * k + KEYFRAME_DIM : KEYFRAME_DIM * k + 2 * KEYFRAME_DIM] += piece.upper[i]
+                H[a, dim * k + dim : dim * k + 2 * dim] += piece.upper[i]
         H[o:, o:] += piece.calib[:-1, :-1]
         g[o:] += piece.calib[:-1, -1]
         for H_part, g_part in schur_of_features(piece, n_keyframes) if piece.features else ():

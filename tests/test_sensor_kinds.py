@@ -35,7 +35,6 @@ NAMING = {
     "tools/simulation/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario.py",
-    "tools/simulation/scenario_file.py",
     "tools/simulation/writing.py",
     "tools/view.py",  # shows what cameras, IMUs and LiDARs recorded
     "tools/simulation/corners.py",

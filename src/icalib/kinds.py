@@ -63,15 +63,15 @@ def models() -> dict[str, SensorModel[Any, Any]]:
 @cache
 def initializers() -> dict[str, Initializer[Any]]:
     """How sensors take part in the initial guess, by type of sensor."""
-    from icalib.initialize.initializer import NO_INITIALIZER
     from icalib.sensors.camera import initialize as camera
+    from icalib.sensors.imu import initialize as imu
     from icalib.sensors.lidar import initialize as lidar
     from icalib.sensors.pose import initialize as pose
     from icalib.sensors.position import initialize as position
     from icalib.sensors.wheels import initialize as wheels
 
     return {
-        "imu": NO_INITIALIZER,
+        "imu": imu.INITIALIZER,
         "camera": camera.INITIALIZER,
         "lidar": lidar.INITIALIZER,
         "wheels": wheels.INITIALIZER,
@@ -142,13 +142,15 @@ def inspectors() -> dict[str, KindInspector]:
 
 @cache
 def simulated_kinds() -> dict[str, type[SimSensor]]:
-    """Classes of simulated sensors by type of sensor; those of the IMU and of cameras are parts of the scenario."""
+    """Classes of simulated sensors by type of sensor; the first IMU and cameras are parts of the scenario."""
+    from icalib.sensors.imu import simulate as imu
     from icalib.sensors.lidar import simulate as lidar
     from icalib.sensors.pose import simulate as pose
     from icalib.sensors.position import simulate as position
     from icalib.sensors.wheels import simulate as wheels
 
     return {
+        "imu": imu.SIMULATED,
         "lidar": lidar.SIMULATED,
         "wheels": wheels.SIMULATED,
         "pose": pose.SIMULATED,

@@ -171,8 +171,8 @@ def test_times_and_notes_name_the_recording(noisy, noisy_joint):
         count = np.bincount(noisy_joint.recording_of(residuals.seconds))
         camera = int(residuals.sensor[-1])
         assert count.tolist() == [len(s.measurements.cameras[camera].stamps_ns) for s in noisy]
-    assert len(noisy_joint.imu_residuals.seconds) == len(path.seconds) - 2
-    assert noisy_joint.imu_residuals.whitened.any(axis=1).all()
+    assert len(noisy_joint.imu_residuals[0].seconds) == len(path.seconds) - 2
+    assert noisy_joint.imu_residuals[0].whitened.any(axis=1).all()
     assert any(
         note.startswith("recording 2: 9.0 s from ") for note in noisy_joint.notes if note.name == "recording_span"
     )

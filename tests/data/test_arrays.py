@@ -91,10 +91,6 @@ def test_every_other_kind():
             lambda: arrays.lidar("lidar0", T[:1], [np.ones((2, 3))], [[0.0]]),
             "lidar0: offset_s must have a row for",
         ),
-        (
-            lambda: arrays.measurements(*(arrays.imu(n, T, np.ones((3, 3)), np.ones((3, 3))) for n in "ab")),
-            "b is a second IMU beside a",
-        ),
     ],
 )
 def test_nonsense_is_refused_in_one_sentence(make: Callable[[], Any], words: str):

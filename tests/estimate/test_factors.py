@@ -24,18 +24,20 @@ from tests.typed import not_none
 
 import icalib.optim
 import icalib.sensors
-from icalib.data.measurements import PoseStream
+from icalib.data.measurements import ImuStream, PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
 from icalib.model.bodies import SIZE
 from icalib.motion.factor import output_at
+from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import EstimatedMotion, offset_at, poses_at
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
 from icalib.optim.rows import MIN_CURVATURE_RATIO
-from icalib.optim.state import KEYFRAME_DIM, State, in_recording, make_layout
+from icalib.optim.state import State, in_recording, make_layout
 from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.camera.track_surfaces import ON_PLANES
+from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
@@ -102,6 +104,55 @@ def imu_sample(unlike, setup_of, imu_free, unit=False):
         return factor.accumulate(at, piece, factor.output(), sums)
 
     return Sample("ImuFactor", setup, state, accumulate, residual, white(residual), made=factor)
+
+
+def with_further_imus(setup, number):
+    """The setup with IMUs that are copies of its own, mounted somewhere; all of their parameters are estimated."""
+    setup, names = with_gravity(setup), tuple(f"imu{k + 1}" for k in range(number))
+    entries, values = [], {}
+    for k, name in enumerate(names):
+        entries += [(name, "rotation", "rotation", 3, True), (name, "translation", "vector", 3, True)]
+        entries += [(name, "time_offset", "vector", 1, True), (name, "intrinsics", "vector", 24, True)]
+        values |= {(name, "rotation"): so3.exp(np.array([0.1, -0.2, 0.15]) * (k + 1.0))}
+        values |= {(name, "translation"): np.array([0.1, 0.05, -0.08]), (name, "time_offset"): np.array([2e-3])}
+        values |= {(name, "intrinsics"): np.full(24, 1e-3)}
+    old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    own = np.random.default_rng(3).normal(size=(len(setup.state.seconds), 9 * number)) * 0.05
+    state = replace(setup.state, values=setup.state.values | values, further_imus=own)
+    return replace(setup, layout=make_layout([*old, *entries], names), state=state)
+
+
+def mounted_imu_sample(unlike, setup_of, imu_free, missing=False):
+    """The second of two further IMUs, preintegrated at another state. missing: it started late and dropped out."""
+    setup = with_further_imus(setup_of(unlike, imu_free=imu_free), 2)
+    own = replace(setup.imu, name="imu2")
+    if missing:
+        middle = 0.5 * own.seconds[-1]
+        kept = (own.seconds > 0.3) & ((own.seconds < middle) | (own.seconds > middle + 0.2))
+        data = ImuStream(
+            "imu2",
+            10**9 + np.round(1e9 * own.seconds[kept]).astype(np.int64),
+            *(x[kept] for x in (own.gyro, own.accel)),
+        )
+        own = ImuData.build(data, setup.sim.scenario.imu_noise)
+    factor = MountedImuFactor.build(own, EstimatedMotion(setup.state, setup.imu, 9.81, 0.5), setup.layout)
+    assert (factor.increments.W[:, 0, 0] == 0.0).any() == missing
+    state = setup.perturbed(np.random.default_rng(0), 0.1)
+
+    def residual(at):
+        bias = at.further_imus[0, 12:18] - factor.increments.bias0[0]
+        return np.append(output_at(factor, at).residual.ravel(), bias / FIRST_BIAS_SIGMA)
+
+    def accumulate(at, piece, sums):
+        return factor.accumulate(at, piece, factor.output(), sums)
+
+    return Sample("MountedImuFactor", setup, state, accumulate, residual, white(residual), made=factor)
+
+
+def slow_motion_sample(unlike, setup_of):
+    setup = setup_of(unlike)
+    factor = SlowMotion("imu0", len(setup.state.seconds), (0, 7))
+    return row_sample(setup, setup.perturbed(np.random.default_rng(0)), factor, "none", False)
 
 
 LOSS_SCALE = 1.5
@@ -598,6 +649,9 @@ SAMPLES = {
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
     "imu, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False, unit=True)),
     "imu, intrinsics, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True, unit=True)),
+    "mounted imu": ("MountedImuFactor", lambda u, s, f: mounted_imu_sample(u, s, False)),
+    "mounted imu, intrinsics, gaps": ("MountedImuFactor", lambda u, s, f: mounted_imu_sample(u, s, True, True)),
+    "slow motion": ("SlowMotion", lambda u, s, f: slow_motion_sample(u, s)),
     "radtan, inertial": ("CornerFactor", lambda u, s, f: corner_sample(u, s, f, 0)),
     "radtan, kinematic, intrinsics": (
         "CornerFactor",
@@ -786,15 +840,16 @@ def test_every_factor_has_a_sample():
 
 
 def sums_of(sample, dense):
-    n = len(sample.state.seconds)
-    pieces = make_pieces(n, sample.setup.layout.size)
+    n, layout = len(sample.state.seconds), sample.setup.layout
+    pieces = make_pieces(n, layout.size, layout.keyframe_dim)
     cost = sum(sample.accumulate(sample.state, p, True) for p in pieces)
     return cost, *dense(pieces, n)
 
 
 def moved(sample, d):
-    o = KEYFRAME_DIM * len(sample.state.seconds)
-    return sample.state.retract(sample.setup.layout, d[:o].reshape(-1, KEYFRAME_DIM), d[o:])
+    layout, n = sample.setup.layout, len(sample.state.seconds)
+    o = layout.keyframe_dim * n
+    return sample.state.retract(layout, d[:o].reshape(n, -1), d[o:])
 
 
 def cost_at(sample, d):
@@ -804,7 +859,9 @@ def cost_at(sample, d):
 
 def scales(sample):
     """Steps of each column: of the size that parameters have."""
-    chain = np.tile(np.repeat([1e-2, 1e-2, 1e-2, 1e-3, 1e-2], 3), len(sample.state.seconds))
+    layout = sample.setup.layout
+    one = [1e-2, 1e-2, 1e-2, 1e-3, 1e-2] + [1e-2, 1e-3, 1e-2] * len(layout.further_imus)
+    chain = np.tile(np.repeat(one, 3), len(sample.state.seconds))
     return np.concatenate([chain, sample.setup.columns_scale()])
 
 
@@ -827,13 +884,13 @@ def sample_of(unlike, setup_of, factor_of, features_of, features_on_planes, spar
 def directions(sample, H, singly):
     """(n, m): random steps of all columns at once, in which a wrong sum shows. singly: instead of them one column each,
     for two keyframes and all calibration parameters of the factor, so that none is small beside the others."""
-    chain, rng = KEYFRAME_DIM * len(sample.state.seconds), np.random.default_rng(10)
-    first = KEYFRAME_DIM * (len(sample.state.seconds) // 2)
+    dim, rng = sample.setup.layout.keyframe_dim, np.random.default_rng(10)
+    chain, first = dim * len(sample.state.seconds), dim * (len(sample.state.seconds) // 2)
     counts = np.diag(H) > 0.0
     alone = (
         counts
         & (np.arange(len(H)) >= first)
-        & ((np.arange(len(H)) >= chain) | (np.arange(len(H)) < first + 2 * KEYFRAME_DIM))
+        & ((np.arange(len(H)) >= chain) | (np.arange(len(H)) < first + 2 * dim))
         & singly
     )
     mixed = [

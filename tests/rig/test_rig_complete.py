@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from tests.cases import each
 
@@ -9,7 +12,7 @@ from icalib.data.measurements import Measurements
 from icalib.errors import RigError
 from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
-from icalib.rig import Camera, Ground, ImuNoise, ImuSensor, Lidar, PoseSensor, Rig, Settings, Wheels, by_name
+from icalib.rig import Camera, Ground, ImuNoise, ImuSensor, Lidar, Parameter, PoseSensor, Rig, Settings, Wheels, by_name
 from icalib.rig.file import check_complete, lack_of, rig_from_dict, rig_to_dict
 from icalib.sensors.position.spec import PositionSensor
 
@@ -58,7 +61,10 @@ def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
 @each(
     ("rig", "words"),
     [
-        (Rig(by_name(IMU, ImuSensor("imu1", "", IMU.noise), LIDAR)), "^imu1 is a second IMU beside imu0"),
+        (
+            Rig(by_name(replace(IMU, time_offset=Parameter("fixed", np.zeros(1))), LIDAR)),
+            "^imu0.time_offset: imu0 is the body",
+        ),
         (Rig(by_name(IMU, Camera("cam0", "", "eucm", (9, 9)))), "^target is missing; .* of cam0"),
         (Rig(by_name(IMU, MOCAP, Wheels("w", "", ground=Ground("floor", 0.1)))), "^w.ground.plane: a LiDAR determines"),
         (

@@ -424,7 +424,7 @@ def test_other_targets_are_read_and_written(tmp_path, text, target):
     assert load_rig(path).target == target
 
 
-def test_two_imus_no_camera(tmp_path):
+def test_imus_without_a_camera(tmp_path):
     imu, rest = "  imu0: {type: imu}\n", f"target: {TARGET}\n"
     camera = "  cam0: {type: camera, model: pinhole-radtan, resolution: [752, 480]}\n"
     assert "there is no camera, no LiDAR, no pose sensor and no position sensor" in complaint(
@@ -436,8 +436,9 @@ def test_two_imus_no_camera(tmp_path):
     )
     lidar = "  lidar0: {type: lidar}\n"
     assert "sensors.lidar0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + lidar + rest)
-    second = complaint(tmp_path, "sensors:\n" + imu + "  imu1: {type: imu}\n" + camera + rest)
-    assert "rig.yaml:3: sensors.imu1: is a second IMU beside imu0; keep one, and calibrate once for each" in second
+    placed = "  imu0: {type: imu, time_offset: {fixed: 0}}\n"
+    second = complaint(tmp_path, "sensors:\n" + placed + "  imu1: {type: imu}\n" + camera + rest)
+    assert "rig.yaml:2: sensors.imu0.time_offset: imu0 is the body" in second
 
 
 def test_without_an_imu_the_first_camera_is_the_body(tmp_path):

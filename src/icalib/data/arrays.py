@@ -28,9 +28,6 @@ from icalib.sensors.stream import Stream
 
 def measurements(*streams: Stream, name: str = "") -> Measurements:
     """The streams of all sensors of one recording, in any order. name: of the recording, for error messages."""
-    imus = [s for s in streams if isinstance(s, ImuStream)]
-    if len(imus) > 1:
-        raise RecordingError(f"{imus[1].name} is a second IMU beside {imus[0].name}; give one.")
     return Measurements.of_streams(*streams, name=name)
 
 

@@ -26,7 +26,6 @@ from icalib.estimate.residual_statistics import Segments
 from icalib.motion.factor import Residuals
 from icalib.optim.arrowhead import (
     UNOBSERVABLE_BELOW,
-    Piece,
     chain_step_given_calib,
     complement,
     in_parallel,
@@ -118,7 +117,7 @@ def _within(sums: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def _priors(parts: Segments) -> np.ndarray:
     """Information and gradient (B + 1, B + 1) of the priors on the calibration parameters."""
-    piece = Piece.zeros(0, 0, parts.problem.layout.size)
+    piece = parts.problem.zeros(0, 0)
     for prior in parts.problem.priors:
         prior.accumulate(parts.state, piece)
     return piece.calib

@@ -131,7 +131,9 @@ def layout_for(
         entries += own_entries(sensor, rig, n_recordings)
     for sensor in sensors:
         entries += model_of(sensor).scene_entries(sensor, rig, n_recordings)
-    return make_layout(entries + bodies.pose_entries() + association.entries)
+    further = [s.name for s in sensors if s.is_inertial]
+    layout = make_layout(entries + bodies.pose_entries() + association.entries, further)
+    return replace(layout, shows_places=not rig.imus_alone)
 
 
 def _taking_part(rig: Rig, association: PlaneAssociation) -> tuple[Sensor, ...]:

@@ -105,12 +105,12 @@ class _Noise:
     among: tuple[np.ndarray, ...]
 
     def mean_change(self, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
-        """Spurious information (B, B) if the trajectory changes by chain (K, 15) and the readings by `readings`: mean
+        """Spurious information (B, B) if the trajectory changes by chain (K, D) and the readings by `readings`: mean
         over both signs."""
         return 0.5 * (self.information_change(1.0, chain, readings) + self.information_change(-1.0, chain, readings))
 
     def information_change(self, sign: float, chain: np.ndarray, readings: np.ndarray | None) -> np.ndarray:
-        """Change (B, B) of the information if trajectory and readings change by `sign` times chain (K, 15) and
+        """Change (B, B) of the information if trajectory and readings change by `sign` times chain (K, D) and
         `readings`. Terms that are odd in the noise are included."""
         noisy_state = self.outcome.state.retract(self.problem.layout, sign * chain, np.zeros(self.problem.layout.size))
         noisy = self.problem if readings is None else _with_noise(self.problem, noisy_state, sign * readings)
@@ -118,7 +118,7 @@ class _Noise:
 
     def change_with_response(self, chain: np.ndarray, readings: np.ndarray) -> np.ndarray:
         """Spurious information (B, B) if the trajectory follows the noise `readings`, in addition to a posterior draw
-        `chain` (K, 15). Noise that both contain is counted once."""
+        `chain` (K, D). Noise that both contain is counted once."""
         noisy_problem = _with_noise(self.problem, self.outcome.state, readings)
         between_keyframes = self.problem.replacing([noisy_problem.chain])
         return self.mean_change(chain + self._step(noisy_problem), readings) - self.mean_change(
@@ -126,7 +126,7 @@ class _Noise:
         )
 
     def _step(self, problem: Problem) -> np.ndarray:
-        """Solver's step (K, 15) of the chain for `problem`, calibration parameters fixed."""
+        """Solver's step (K, D) of the chain for `problem`, calibration parameters fixed."""
         pieces = self.outcome.workspace or problem.pieces()
         problem.linearise(self.outcome.state, pieces, problem.residuals(), curved=True)
         factors = solve(pieces, problem.n_keyframes, problem.tolerance, essential=problem.layout.essential).factors

@@ -36,7 +36,7 @@ from icalib.optim.arrowhead import (
     marginalise,
     marginalise_in_segments,
 )
-from icalib.optim.state import Block, Key, Layout, State
+from icalib.optim.state import FURTHER_IMU_DIM, Block, Key, Layout, State
 from icalib.rig import Parameter, Rig
 from icalib.rig.scene import FRAME as SENSOR_FRAME
 from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, WORLD
@@ -112,8 +112,13 @@ class Problem:
 
     def pieces(self, sums: bool = True) -> tuple[Piece, ...]:
         """Pieces of the chain, sums zero; without `sums`, for residuals only."""
-        pieces = make_pieces(self.n_keyframes, self.layout.size if sums else None)
+        pieces = make_pieces(self.n_keyframes, self.layout.size if sums else None, self.layout.keyframe_dim)
         return tuple(self.attach(p, len(pieces) > 1) for p in pieces) if sums else pieces
+
+    def zeros(self, first: int, last: int, n_columns: int = 0) -> Piece:
+        """A piece between keyframes `first` and `last` with sums zero, and `n_columns` columns beside the calibration
+        parameters."""
+        return Piece.zeros(first, last, self.layout.size + n_columns, self.layout.keyframe_dim)
 
     def attach(self, piece: Piece, keep: bool = False) -> Piece:
         """The piece with workspace for parameters that factors eliminate; `keep`: it shares a keyframe with another
@@ -149,7 +154,7 @@ class Problem:
     def sums_of(self, state: State, first: int, last: int) -> Piece:
         """Sums between keyframes `first` and `last`, with the true curvature of robust losses. Residuals are
         discarded."""
-        piece = self.attach(Piece.zeros(first, last, self.layout.size))
+        piece = self.attach(self.zeros(first, last))
         for factor in self.factors.values():
             factor.accumulate(state, piece, factor.discarded_output(), curved=True)
         self.add_bias_prior(state, piece)
@@ -209,11 +214,11 @@ class Problem:
         without their gradient. `n_columns` further columns beside the calibration parameters are zero, for gradients to
         be marginalised. Fills `out` with residuals."""
         size = self.layout.size
-        narrow = self.attach(Piece.zeros(first, last, size))
+        narrow = self.attach(self.zeros(first, last))
         self.add_measurements(state, narrow, out)
         self.add_bias_prior(state, narrow)
         self.hold_frames(state, narrow)
-        wide = Piece.zeros(first, last, size + n_columns)
+        wide = self.zeros(first, last, n_columns)
         wide.side[:, :, :size], wide.calib[:size, :size] = narrow.side[:, :, :size], narrow.calib[:size, :size]
         features = None if narrow.features is None else narrow.features.widened(size + n_columns)
         return replace(narrow, side=wide.side, calib=wide.calib, features=features)
@@ -303,10 +308,19 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
         return state
     near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
     poses = poses_at("inertial", keyframes, near, state, inputs.imu, gravity_of(state, inputs.rig.gravity), False)
-    starts = first_keyframes(inputs.imu, keyframes)
+    starts, state = first_keyframes(inputs.imu, keyframes), with_further_imus(inputs, state)
     return State(
-        keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts
-    )
+        keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts,
+        state.further_imus[near],
+    )  # fmt: skip
+
+
+def with_further_imus(inputs: Inputs, state: State) -> State:
+    """The state with the states of all IMUs after the first, at zero if it has none: rows are linear in them."""
+    n = FURTHER_IMU_DIM * len(inputs.layout.further_imus)
+    if state.further_imus.shape[1] == n:
+        return state
+    return replace(state, further_imus=np.zeros((len(state.seconds), n)))
 
 
 def keyframes_for(inputs: Inputs, times: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -85,7 +85,7 @@ LOOSE_FRAME_INFORMATION = 1e-3
 
 
 class PieceGradient(NamedTuple):
-    """Gradient of half the chi^2 of a segment. chain (n, 15): of its keyframes from `first` on; calib (B,): of the
+    """Gradient of half the chi^2 of a segment. chain (n, D): of its keyframes from `first` on; calib (B,): of the
     calibration parameters."""
 
     first: int
@@ -155,7 +155,7 @@ class Segments:
         """Sums of segment `g`, its keyframes not yet eliminated; fills `scratch` with its residuals."""
         problem, state = self.problem, self.state
         first, last = (int(k) for k in self.ends[g : g + 2])
-        piece = problem.attach(Piece.zeros(first, last, problem.layout.size))
+        piece = problem.attach(problem.zeros(first, last))
         problem.add_measurements(state, piece, scratch)
         problem.add_bias_prior(state, piece)
         if not problem.framed:

@@ -79,7 +79,7 @@ def score_test(
 def _response(segments: Segments, effect: Callable[[np.ndarray], Factor], m: int) -> _Response:
     """Difference quotients of rows and gradients by the parameters of `effect`."""
     problem, B = segments.problem, segments.problem.layout.size
-    chain, calib = np.zeros((m, problem.n_keyframes, 15)), np.zeros((m, B))
+    chain, calib = np.zeros((m, problem.n_keyframes, problem.layout.keyframe_dim)), np.zeros((m, B))
     scores, information = np.zeros((segments.count, m)), np.zeros((m, m))
     changed = [[effect(sign * STEP * axis) for sign in (1.0, -1.0)] for axis in np.eye(m)]
     unchanged = effect(np.zeros(m))
@@ -98,7 +98,7 @@ def _response(segments: Segments, effect: Callable[[np.ndarray], Factor], m: int
 
 def _at(segments: Segments, factor: Factor, first: int, last: int) -> tuple[Whitened, PieceGradient]:
     """Rows of `factor` between two keyframes, all others zero, and their gradient."""
-    out, piece = factor.output(), Piece.zeros(int(first), int(last), segments.problem.layout.size)
+    out, piece = factor.output(), segments.problem.zeros(int(first), int(last))
     factor.accumulate(segments.state, piece, out)
     return out, PieceGradient.of(piece)
 

@@ -161,15 +161,20 @@ def sensor_intrinsics(c: Calibration) -> list[str]:
     return phrases
 
 
-def imu_values(c: Calibration) -> np.ndarray:
-    """(24,) IMU intrinsics (see `motion.imu_model`), zeros without any."""
-    group = None if c.imu is None else c.group_or_none(c.imu, "intrinsics")
+def imu_values(c: Calibration, imu: str | None) -> np.ndarray:
+    """(24,) intrinsics of an IMU (see `motion.imu_model`), zeros without any."""
+    group = None if imu is None else c.group_or_none(imu, "intrinsics")
     return np.zeros(24) if group is None else group.value
+
+
+def imus(c: Calibration) -> tuple[str, ...]:
+    """Names of the IMUs, that of the body first."""
+    return () if c.imu is None else (c.imu, *(name for name in c.of_type("imu") if name != c.imu))
 
 
 def imu_intrinsics(c: Calibration) -> list[str]:
     """Words for scale and misalignment of the IMU, if any value is nonzero."""
-    return [f"scale and misalignment of {c.imu}"] if imu_values(c).any() else []
+    return [f"scale and misalignment of {c.imu}"] if imu_values(c, c.imu).any() else []
 
 
 def topic(c: Calibration, name: str, default: str) -> str:

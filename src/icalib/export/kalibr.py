@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.export.common import CameraParameters, imu_values, inverse, lens_of, restarts, time_offset
+from icalib.export.common import CameraParameters, imu_values, imus, inverse, lens_of, restarts, time_offset
 from icalib.geometry import so3
 from icalib.result import Calibration
 from icalib.sensors.camera.stream import CornerResiduals, image_of
@@ -77,36 +77,48 @@ def imu_yaml(calibration: Calibration) -> str:
     c = calibration
     if c.imu is None:
         raise CalibrationError("the rig has no IMU, so there is no imu.yaml to write.")
-    if c.imu not in c.rates:
-        raise CalibrationError(f"the rate of {c.imu} is not known, and Kalibr's imu.yaml needs one; calibrate again.")
-    noise = c.rig["sensors"][c.imu]["noise"]
+    comment = (
+        "# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame to the imu frame; "
+        f"{'imu0' if imus(c)[1:] else 'the imu'} is the body here."
+    )
+    comments = [comment, *_renamed("imu", imus(c))]
+    if imus(c)[1:]:
+        comments.append("# t_imu0 = t_imu + time_offset [s].")
+    return _text(comments, {f"imu{k}": _imu(c, name) for k, name in enumerate(imus(c))})
+
+
+def _imu(c: Calibration, name: str) -> dict[str, Any]:
+    """Kalibr's entry of one IMU."""
+    if name not in c.rates:
+        raise CalibrationError(f"the rate of {name} is not known, and Kalibr's imu.yaml needs one; calibrate again.")
+    noise = c.rig["sensors"][name]["noise"]
+    T_body_imu, offset = np.eye(4), 0.0
+    if name != c.imu:
+        T_body_imu = inverse(_T_imu_kalibr(c, c.imu)) @ c.T_imu_sensor(name) @ _T_imu_kalibr(c, name)
+        offset = time_offset(c, name)
     data: dict[str, Any] = {
-        "T_i_b": np.eye(4).tolist(),
+        "T_i_b": inverse(T_body_imu).tolist() if name != c.imu else np.eye(4).tolist(),
         **{theirs: float(noise[ours]) for ours, theirs in KALIBR_NOISE.items()},
         "model": "calibrated",
-        "rostopic": f"/{c.imu}",
-        "time_offset": 0.0,
-        "update_rate": float(c.rates[c.imu]),
+        "rostopic": f"/{name}",
+        "time_offset": offset,
+        "update_rate": float(c.rates[name]),
     }
-    comment = (
-        "# Kalibr's imu file by icalib. T_i_b takes coordinates in the body frame to the imu frame; the imu is the "
-        "body here."
-    )
-    return _text([comment, *_renamed("imu", (c.imu,))], {"imu0": data | _intrinsics(c)})
+    return data | _intrinsics(c, name)
 
 
-def _T_imu_kalibr(c: Calibration) -> np.ndarray:
-    """(4, 4) pose of Kalibr's IMU frame, which has the axes of the accelerometer, in icalib's, which has those of the
-    gyroscope."""
+def _T_imu_kalibr(c: Calibration, imu: str | None) -> np.ndarray:
+    """(4, 4) pose of Kalibr's frame of an IMU, which has the axes of the accelerometer, in icalib's, which has those of
+    the gyroscope."""
     T = np.eye(4)
-    T[:3, :3] = so3.exp(-imu_values(c)[12:15])
+    T[:3, :3] = so3.exp(-imu_values(c, imu)[12:15])
     return T
 
 
 def _camera(c: Calibration, index: int, lens: CameraParameters, overlaps: np.ndarray) -> dict[str, Any]:
     name = c.cameras[index]
     T_cam_imu = inverse(c.T_imu_sensor(name))
-    data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": (T_cam_imu @ _T_imu_kalibr(c)).tolist()}
+    data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": (T_cam_imu @ _T_imu_kalibr(c, c.imu)).tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
     return data | {
@@ -128,10 +140,10 @@ def _lens_fields(lens: CameraParameters) -> dict[str, Any]:
     }
 
 
-def _intrinsics(c: Calibration) -> dict[str, Any]:
+def _intrinsics(c: Calibration, imu: str) -> dict[str, Any]:
     """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, of w and f in the axes of the
     accelerometer; empty if the IMU is assumed ideal."""
-    x = imu_values(c)
+    x = imu_values(c, imu)
     if not x.any():
         return {}
     return {
@@ -140,7 +152,7 @@ def _intrinsics(c: Calibration) -> dict[str, Any]:
         "gyroscopes": {
             "M": lower(x[6:12]).tolist(),
             "A": x[15:].reshape(3, 3).tolist(),
-            "C_gyro_i": _T_imu_kalibr(c)[:3, :3].tolist(),
+            "C_gyro_i": _T_imu_kalibr(c, imu)[:3, :3].tolist(),
         },
     }
 

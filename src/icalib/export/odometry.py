@@ -16,6 +16,7 @@ from icalib.export.common import (
     guesses,
     imu_intrinsics,
     imu_values,
+    imus,
     inverse,
     lens_of,
     need,
@@ -44,13 +45,14 @@ _OTHER_OFFSET_S = 1e-5
 
 def openvins(c: Calibration) -> Export:
     """Files of cameras and IMU. Raises CalibrationError without a camera, or without an IMU whose rate is known."""
-    imu = need_imu(c, "OpenVINS")
+    need_imu(c, "OpenVINS")
     need(c.cameras, "camera", "OpenVINS")
-    if imu not in c.rates:
-        raise CalibrationError(f"the rate of {imu} is not known, and OpenVINS wants one; calibrate again.")
+    for name in imus(c):
+        if name not in c.rates:
+            raise CalibrationError(f"the rate of {name} is not known, and OpenVINS wants one; calibrate again.")
     lenses = [lens_of(c, name, "OpenVINS", tuple(MODELS)) for name in c.cameras]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
-    sentences += _offsets(c) + no_place_for("OpenVINS", others(c, *c.cameras)) + guesses(c, c.cameras)
+    sentences += _offsets(c) + no_place_for("OpenVINS", others(c, *c.cameras, *imus(c)[1:])) + guesses(c, c.cameras)
     overlaps = cam_overlaps(c)
     chain: dict[str, Any] = {}
     for i, (name, lens) in enumerate(zip(c.cameras, lenses, strict=True)):
@@ -77,7 +79,7 @@ def openvins(c: Calibration) -> Export:
     ]
     files = {
         "kalibr_imucam_chain.yaml": yaml_text(comments, chain, HEAD),
-        "kalibr_imu_chain.yaml": _openvins_imu(c, imu),
+        "kalibr_imu_chain.yaml": _openvins_imus(c),
     }
     return Export(files, sentences)
 
@@ -92,15 +94,30 @@ def _offsets(c: Calibration) -> tuple[str, ...]:
     return (f"OpenVINS uses the time offset of {c.cameras[0]} for all cameras; from it differ {', '.join(off)}.",)
 
 
-def _openvins_imu(c: Calibration, imu: str) -> str:
-    """File of the IMU. w: rate, f: specific force, both in the imu frame; gyro = Tw R_IMUtoGYRO w + Tg f, accel = Ta
-    R_IMUtoACC f. Its model "kalibr" reads Tw and Ta as lower triangular, and uses both rotations."""
-    noise, x = c.rig["sensors"][imu]["noise"], imu_values(c)
-    data = {
-        "T_i_b": np.eye(4).tolist(),
+def _openvins_imus(c: Calibration) -> str:
+    """File of the IMUs; OpenVINS reads the first. w: rate, f: specific force, both in the imu frame; gyro = Tw
+    R_IMUtoGYRO w + Tg f, accel = Ta R_IMUtoACC f. Its model "kalibr" reads Tw and Ta as lower triangular, and uses both
+    rotations."""
+    several = len(imus(c)) > 1
+    frame = (
+        "frame of imu0, with the axes of its gyroscope," if several else "imu frame, with the axes of the gyroscope,"
+    )
+    comments = [
+        f"{' and '.join(imus(c))} for OpenVINS, by icalib. The {frame} is the body frame.",
+        *(["OpenVINS reads imu0 only. T_i_b takes coordinates in the body frame to that of the IMU."] * several),
+        "Densities are in continuous time, SI.",
+        "gyro = Tw R_IMUtoGYRO rate + Tg force, accel = Ta R_IMUtoACC force, of rate and force in the imu frame.",
+    ]
+    return yaml_text(comments, {f"imu{k}": _openvins_imu(c, name) for k, name in enumerate(imus(c))}, HEAD)
+
+
+def _openvins_imu(c: Calibration, imu: str) -> dict[str, Any]:
+    noise, x = c.rig["sensors"][imu]["noise"], imu_values(c, imu)
+    return {
+        "T_i_b": inverse(c.T_imu_sensor(imu)).tolist() if imu != c.imu else np.eye(4).tolist(),
         **{theirs: float(noise[ours]) for ours, theirs in KALIBR_NOISE.items()},
         "rostopic": topic(c, imu, f"/{imu}"),
-        "time_offset": 0.0,
+        "time_offset": time_offset(c, imu) if imu != c.imu else 0.0,
         "update_rate": float(c.rates[imu]),
         "model": "kalibr",
         "Tw": lower(x[6:12]).tolist(),
@@ -109,12 +126,6 @@ def _openvins_imu(c: Calibration, imu: str) -> str:
         "R_IMUtoACC": so3.exp(x[12:15]).tolist(),
         "Tg": x[15:].reshape(3, 3).tolist(),
     }
-    comments = [
-        f"{imu} for OpenVINS, by icalib. The imu frame, with the axes of the gyroscope, is the body frame.",
-        "Densities are in continuous time, SI.",
-        "gyro = Tw R_IMUtoGYRO rate + Tg force, accel = Ta R_IMUtoACC force, of rate and force in the imu frame.",
-    ]
-    return yaml_text(comments, {"imu0": data}, HEAD)
 
 
 _MERGE_INTO_MINS = (

@@ -44,7 +44,7 @@ InputsWithMotion = tuple[Inputs, State]  # inputs, and a state whose poses are t
 InitialGuess = tuple[Inputs, State, Values]  # inputs, start state, values to which unobservable parameters are reset
 
 # Ranks of the kinds that show the motion, the preferred one first: see `MotionSource`.
-BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING = range(6)
+BY_TARGET, BY_SCANS, BY_TRACKS, BY_POSES, BY_POSITIONS, BY_DEAD_RECKONING, BY_READINGS = range(7)
 
 
 class MotionSource(NamedTuple):
@@ -153,9 +153,6 @@ class Initializer(Generic[S]):
         """The largest spacing of keyframes [s] at which the error of the assumed motion is small against the noise of
         sensors of this kind."""
         return np.inf
-
-
-NO_INITIALIZER: Initializer[Sensor] = Initializer()
 
 
 def initializer_of(sensor: Sensor) -> Initializer[Any]:

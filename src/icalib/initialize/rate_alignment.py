@@ -69,7 +69,7 @@ def align_rates(imu: ImuData, name: str, rates: SensorRates, given_offset: float
     refuse_clock_jumps(
         imu, name, alike, alignment.offset, lambda part, offset: _unexplained_at(imu, part, alignment, offset)
     )
-    _check_offset(imu, name, _unexplained(imu, alike, alignment, averaged), keep)
+    _check_offset(imu, name, unexplained_share(imu, alike, alignment, averaged), keep)
     _check_scale(imu, name, rates, alignment, averaged)
     return alignment
 
@@ -83,15 +83,15 @@ def _first_match(
     If none matches over RATE_MEAN_S, means over LONG_RATE_MEAN_S are compared: noise shrinks at least with the root of
     the duration, a different motion does not. If none matches then, returns the first.
     """
-    unexplained = [_unexplained(imu, *candidate) for candidate in candidates]
+    unexplained = [unexplained_share(imu, *candidate) for candidate in candidates]
     alike = [k for k, share in enumerate(unexplained) if share <= MAX_UNEXPLAINED_RATE]
     if alike:
         best = int(np.argmin(unexplained))
         is_clear = unexplained[best] < MAX_UNEXPLAINED_RATIO_OF_OTHER * unexplained[alike[0]]
         return candidates[best if is_clear else alike[0]], RATE_MEAN_S
     for candidate in candidates:
-        share = min(MAX_UNEXPLAINED_RATE, np.sqrt(RATE_MEAN_S / LONG_RATE_MEAN_S) * _unexplained(imu, *candidate))
-        if _unexplained(imu, *candidate, LONG_RATE_MEAN_S) <= share:
+        share = min(MAX_UNEXPLAINED_RATE, np.sqrt(RATE_MEAN_S / LONG_RATE_MEAN_S) * unexplained_share(imu, *candidate))
+        if unexplained_share(imu, *candidate, LONG_RATE_MEAN_S) <= share:
             return candidate, LONG_RATE_MEAN_S
     return candidates[0], RATE_MEAN_S
 
@@ -143,7 +143,9 @@ def _check_offset(imu: ImuData, name: str, unexplained: float, given: bool) -> N
         )
 
 
-def _unexplained(imu: ImuData, rates: SensorRates, alignment: RateAlignment, averaged: float = RATE_MEAN_S) -> float:
+def unexplained_share(
+    imu: ImuData, rates: SensorRates, alignment: RateAlignment, averaged: float = RATE_MEAN_S
+) -> float:
     """Median difference between the rates of IMU and sensor, over the median rate, of means over `averaged` s. Means of
     a slow rotation are left out, because they show noise: a vehicle drives straight most of the time. The known noise
     of the sensor's rates is subtracted."""
@@ -159,7 +161,7 @@ def _unexplained(imu: ImuData, rates: SensorRates, alignment: RateAlignment, ave
 def _unexplained_at(imu: ImuData, rates: SensorRates, alignment: RateAlignment, offset: float) -> float:
     """The unexplained share of `rates` at another offset; infinite if the IMU was not running."""
     shifted = replace(alignment, offset=offset)
-    return _unexplained(imu, rates, shifted) if covered(imu, rates, offset).any() else np.inf
+    return unexplained_share(imu, rates, shifted) if covered(imu, rates, offset).any() else np.inf
 
 
 def _side_by_side(
@@ -322,7 +324,8 @@ def better_alignment(
     """`alignment`, or `alternative` if its unexplained rate is clearly smaller."""
     return (
         alternative
-        if _unexplained(imu, rates, alternative) < MAX_UNEXPLAINED_RATIO_OF_OTHER * _unexplained(imu, rates, alignment)
+        if unexplained_share(imu, rates, alternative)
+        < MAX_UNEXPLAINED_RATIO_OF_OTHER * unexplained_share(imu, rates, alignment)
         else alignment
     )
 
@@ -345,7 +348,10 @@ def alignment_as_stated(
 def rates_contradict(imu: ImuData, rates: SensorRates, alignment: RateAlignment) -> bool:
     """Whether the sensors turned, but not as the `alignment` predicts."""
     (_, compared), averaged = _first_match(imu, [(rates, alignment)])
-    return not is_still(*rms_rates(imu, rates)) and _unexplained(imu, rates, compared, averaged) > MAX_UNEXPLAINED_RATE
+    return (
+        not is_still(*rms_rates(imu, rates))
+        and unexplained_share(imu, rates, compared, averaged) > MAX_UNEXPLAINED_RATE
+    )
 
 
 def no_overlap(imu: ImuData, name: str) -> EstimationError:

@@ -76,7 +76,7 @@ def fit_imu_trajectory(
     if solution is None:
         return None
     R_is, x = solution
-    R_world_map, R_map_imu = _levelling_rotation(x[6:9]), path.rotation @ R_is.T
+    R_world_map, R_map_imu = levelling_rotation(x[6:9]), path.rotation @ R_is.T
     position = (path.position - R_map_imu @ x[3:6]) @ R_world_map.T
     velocity = np.zeros_like(position)
     start = ImuTrajectory(gyro, t, R_world_map @ R_map_imu, position, velocity, aligned.gyro_bias, x[9:12], gravity)
@@ -86,7 +86,7 @@ def fit_imu_trajectory(
     return TrajectoryFit(guess, start.smoothed(), float(np.linalg.norm(x[6:9])), R_world_map, unexplained, mirrored)
 
 
-def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
+def levelling_rotation(gravity: np.ndarray) -> np.ndarray:
     """R_world_map: the smallest rotation that turns gravity (3,) to -z."""
     d = -gravity / np.linalg.norm(gravity)
     axis = np.array([d[1], -d[0], 0.0])  # d x z

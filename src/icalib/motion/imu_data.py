@@ -15,7 +15,7 @@ from icalib.geometry import so3
 from icalib.geometry.small import mul3, polynomial_means, tmul3
 from icalib.geometry.targets.base import BOARD
 from icalib.optim.state import Key, Layout, State
-from icalib.rig import ImuNoise, Rig, scene
+from icalib.rig import ImuNoise, ImuSensor, Rig, scene
 from icalib.sensors.sensor import Sampling
 
 SAME_INSTANT_S = 1e-6  # s: on a common grid of stamps, rounding must not decide which of two instants is nearer
@@ -225,18 +225,33 @@ def _is_dense(measurements: Measurements) -> bool:
 def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> ImuData | None:
     """As `imu_data`, for joined recordings. The noise within gaps follows from the motion of each recording."""
     imus = [(p, imu) for p in parts if (imu := imu_data(rig, p.measurements)) is not None]
-    if len(imus) < 2 or joined.imu is None:
-        return imus[0][1] if imus else None
-    seconds = joined.imu.seconds
+    return _joined(imus, joined.imu) if imus and joined.imu is not None else None
+
+
+def further_imu_data(imu: ImuSensor, parts: Sequence[Part], joined: Measurements) -> ImuData:
+    """Readings of an IMU after the first, in all `parts` of joined recordings."""
+    streams = [(p, p.measurements.streams[imu.name]) for p in parts]
+    built = [(p, ImuData.build(s, imu.noise, False, imu.sampling)) for p, s in streams if isinstance(s, ImuStream)]
+    stream = joined.streams[imu.name]
+    assert isinstance(stream, ImuStream)
+    return _joined(built, stream)
+
+
+def _joined(imus: Sequence[tuple[Part, ImuData]], stream: ImuStream) -> ImuData:
+    """The readings `imus` of each recording as one. stream: the same readings on the joined clock."""
+    first = imus[0][1]
+    if len(imus) < 2:
+        return first
+    seconds = stream.seconds
+    begins = [float(seconds[p.rows[stream.key].start]) for p, _ in imus]
     # The interval between two recordings has a variance, too, but no factor uses it.
     variance = np.concatenate([np.vstack([imu.variance, imu.variance[-1:]]) for _, imu in imus])[:-1]
-    gaps = tuple((a + p.begin, b + p.begin) for p, imu in imus for a, b in imu.gaps)
+    gaps = tuple((a + begin, b + begin) for begin, (_, imu) in zip(begins, imus, strict=True) for a, b in imu.gaps)
     last = np.cumsum([len(imu.seconds) for _, imu in imus])[:-1] - 1
     seams = tuple((float(seconds[i]), float(seconds[i + 1])) for i in last)
-    gyro, accel = np.ascontiguousarray(joined.imu.gyro), np.ascontiguousarray(joined.imu.accel)
-    first = imus[0][1]
+    gyro, accel = np.ascontiguousarray(stream.gyro), np.ascontiguousarray(stream.accel)
     model = first.walk, gaps, seams, first.forwards, first.unit, first.sampling
-    return ImuData(joined.imu.name, seconds, gyro, accel, variance, *model)
+    return ImuData(stream.name, seconds, gyro, accel, variance, *model)
 
 
 # Scale-misalignment model of IMU readings, in the axes of the gyroscope.

@@ -147,7 +147,7 @@ def rows_at(
     J = np.zeros((n, m, KEYFRAME_PAIR_DIM + n_pose + J_further.shape[2]))
     J[:, :, KEYFRAME_PAIR_DIM + n_pose :] = J_further
     for k, (by_pose, at) in enumerate(zip(J_pose, ends, strict=True)):
-        _chain_rows(by_pose, at, KEYFRAME_DIM * k, J)
+        add_pose_chain(by_pose, at, KEYFRAME_DIM * k, KEYFRAME_PAIR_DIM, J)
     return Rows(residual, J)
 
 
@@ -216,8 +216,9 @@ def chain_width(at):
 
 
 @njit(cache=True, nogil=True)
-def _chain_rows(J_pose, at, first, J):
-    """Adds to J (n, m, w) the derivatives of rows with Jacobians J_pose (n, m, 6) by the poses `at`."""
+def add_pose_chain(J_pose, at, first, calib, J):
+    """Adds to J (n, m, w) the derivatives of rows with Jacobians J_pose (n, m, 6) by the poses `at`. Keyframe columns
+    start at `first`, calibration columns at `calib`."""
     m = J_pose.shape[1]
     A, B = np.empty((6, 6)), np.empty((m, 6))
     for i in range(len(J_pose)):
@@ -227,4 +228,4 @@ def _chain_rows(J_pose, at, first, J):
                 B[q, c] = 0.0
                 for k in range(6):
                     B[q, c] += J_pose[i, q, k] * A[k, c]
-        add_chain(i, at, J_pose[i], B, first, KEYFRAME_PAIR_DIM, J[i])
+        add_chain(i, at, J_pose[i], B, first, calib, J[i])

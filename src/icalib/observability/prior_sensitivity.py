@@ -204,7 +204,9 @@ def _unguessed(inputs: Inputs) -> list[Block]:
 
 def _moved(problem: Problem, state: State, step: np.ndarray) -> State:
     """`state` with the calibration parameters moved by `step` (B,), in tolerance units."""
-    return state.retract(problem.layout, np.zeros((len(state.seconds), 15)), problem.tolerance * step)
+    return state.retract(
+        problem.layout, np.zeros((len(state.seconds), problem.layout.keyframe_dim)), problem.tolerance * step
+    )
 
 
 def calib_difference(problem: Problem, a: State, b: State) -> np.ndarray:

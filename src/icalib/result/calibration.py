@@ -175,10 +175,9 @@ class Calibration:
         return self.residuals_of(TrackResiduals.kind)
 
     @property
-    def imu_residuals(self) -> ImuResiduals:
-        """Residuals of the IMU. Raises ValueError without an IMU."""
-        (residuals,) = self.residuals_of(ImuResiduals.kind)
-        return residuals
+    def imu_residuals(self) -> tuple[ImuResiduals, ...]:
+        """Residuals of each IMU, that of the body first."""
+        return self.residuals_of(ImuResiduals.kind)
 
     @property
     def lidar_residuals(self) -> tuple[Any, ...]:

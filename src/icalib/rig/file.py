@@ -16,7 +16,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, NoTarget, Scene, Target
 from icalib.geometry.targets.families import family_name
 from icalib.rig.rig import ANYWHERE, SENSOR_TYPES, Gravity, Rig, Settings, by_name, gravity_to_plain, parse_gravity
-from icalib.sensors.sensor import TARGET_FRAME, Lack, Sensor, has_imu
+from icalib.sensors.sensor import MOUNTED_NAMES, TARGET_FRAME, Lack, Sensor, has_imu
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -261,11 +261,11 @@ def check_complete(rig: Rig) -> None:
 
 
 def _lacks(rig: Rig) -> Iterator[Lack]:
-    yield from _second_imu(rig)
+    yield from _mounted_body(rig)
     if rig.body and rig.body not in rig.sensors:
         near = suggestion(rig.body, rig.sensors)
         yield Lack(("body",), f"there is no sensor {rig.body}{near}; available are {', '.join(rig.sensors)}.")
-    if not any(sensor.gives_motion for sensor in rig.mounted):
+    if not any(sensor.gives_motion or sensor.is_inertial for sensor in rig.mounted):
         yield Lack(("sensors",), _no_motion(rig))
     for sensor in rig.sensors.values():
         yield from sensor.lacks(rig.sensors, rig.has_target)
@@ -280,11 +280,16 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
         )
 
 
-def _second_imu(rig: Rig) -> Iterator[Lack]:
-    """Each IMU after the first: the estimator integrates only one. No other check refuses a second IMU."""
-    first, *surplus = [s.name for s in rig.sensors.values() if s.is_inertial] or [""]
-    for name in surplus:
-        yield Lack(("sensors", name), f"is a second IMU beside {first}; keep one, and calibrate once for each.")
+def _mounted_body(rig: Rig) -> Iterator[Lack]:
+    """Extrinsics or a time offset of the IMU to which those of all other sensors refer."""
+    imu, others = rig.imu, " or ".join(s.name for s in rig.further_imus)
+    for name in MOUNTED_NAMES if imu is not None else ():
+        stated = getattr(imu, name)
+        if stated.mode != "free" or stated.value is not None:
+            advice = f", or make {others} the body with body: {rig.further_imus[0].name}" if others else ""
+            yield Lack(
+                ("sensors", imu.name, name), f"{imu.name} is the body, to which this would refer; remove it{advice}."
+            )
 
 
 def _unknown_frames(rig: Rig) -> Iterator[Lack]:

@@ -125,13 +125,15 @@ def by_name(*sensors: Sensor) -> dict[str, Sensor]:
 class Rig:
     """All sensors of a robot, the target that they see, and the settings of the estimator.
 
-    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind. gravity, gravity_sigma:
+    sensors: by name; sorted by kind in the order of `SENSOR_KINDS`, and as given within a kind, but the IMU that is the
+    body comes first. gravity, gravity_sigma:
     magnitude and its standard deviation [m/s^2]; 0: exact. path: the rig file, None if not read from one. body: name of
     the sensor in whose frame results give poses; empty: `reference`.
 
-    The reference is the IMU, or without one the first sensor that determines the motion (`reference_without_imu`). A
-    rig with cameras only has no motion model: images with the same stamp share a pose, and poses are independent. Any
-    other rig without an IMU assumes smooth motion. Raises RigError if two sensors have the same name.
+    The reference is the IMU, of several the `body` or else the first; or without one the first sensor that determines
+    the motion (`reference_without_imu`). A rig with cameras only has no motion model: images with the same stamp share
+    a pose, and poses are independent. Any other rig without an IMU assumes smooth motion. Raises RigError if two
+    sensors have the same name.
     """
 
     sensors: Mapping[str, Sensor]
@@ -144,8 +146,12 @@ class Rig:
 
     def __post_init__(self) -> None:
         by_name(*self.sensors.values())
-        ordered = sorted(self.sensors.values(), key=lambda s: SENSOR_KINDS.index(s.sensor_type))
-        object.__setattr__(self, "sensors", {s.name: s for s in ordered})
+        ordered = sorted(
+            self.sensors.values(),
+            key=lambda s: (SENSOR_KINDS.index(s.sensor_type), s.is_inertial and s.name != self.body),
+        )
+        first = next((s.name for s in ordered if s.is_inertial), "")
+        object.__setattr__(self, "sensors", {s.name: _as_mounted(s, s.name != first) for s in ordered})
 
     def of(self, kind: type[T]) -> tuple[T, ...]:
         """All sensors of class `kind`, in the order of the rig file."""
@@ -153,13 +159,18 @@ class Rig:
 
     @property
     def mounted(self) -> tuple[Sensor, ...]:
-        """All sensors except the IMU; their extrinsics are relative to `reference`."""
+        """All sensors except the first IMU; their extrinsics are relative to `reference`."""
         return tuple(s for s in self.sensors.values() if s is not self.imu)
 
     @property
     def imu(self) -> ImuSensor | None:
-        """The IMU; None if the rig has none."""
+        """The IMU that is the body; None if the rig has none."""
         return next(iter(self.of(ImuSensor)), None)
+
+    @property
+    def further_imus(self) -> tuple[ImuSensor, ...]:
+        """The IMUs after the first, which are mounted on it."""
+        return self.of(ImuSensor)[1:]
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
@@ -212,6 +223,11 @@ class Rig:
         return len(self.cameras) == len(self.sensors)
 
     @property
+    def imus_alone(self) -> bool:
+        """True if all sensors are IMUs."""
+        return len(self.of(ImuSensor)) == len(self.sensors)
+
+    @property
     def assumes_motion(self) -> bool:
         """True if the IMU is not a real sensor, but stands for an assumption of smooth motion."""
         return self.imu is not None and self.imu.assumed
@@ -256,6 +272,13 @@ class Rig:
                 sensors = [s for s in sensors if not isinstance(s, _SHORT[name])]
                 sensors += _several(value)
         return dataclasses.replace(self, **({"sensors": by_name(*sensors)} | plain))
+
+
+def _as_mounted(sensor: Sensor, mounted: bool) -> Sensor:
+    """The sensor; an IMU knows whether it is mounted on another one."""
+    if not isinstance(sensor, ImuSensor) or sensor.mounted == mounted:
+        return sensor
+    return dataclasses.replace(sensor, mounted=mounted)
 
 
 def _several(value: Sensor | Iterable[Sensor] | None) -> tuple[Sensor, ...]:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from icalib.base.remark import Remark
+from icalib.data.measurements import ImuStream
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.parameter_changes import Change, changes, scatter
 from icalib.estimate.residual_statistics import Segments, rows_of
 from icalib.kinds import assessors
+from icalib.motion.factor import FitKey
 from icalib.observability.assessor import AssessedEstimate, Cause, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, relaxed
@@ -366,7 +368,7 @@ def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -
     rig, fits = assessed.inputs.rig, assessed.fits
     yield from (Cause(sentence, 0.0) for a in assessments(assessed) for sentence in a.many_rejected)
     noise_ratio = _noise_over_stated(assessed.inputs)
-    noise = list(_noise_of_imu(assessed, misfit, noise_ratio))
+    noise = list(_noise_of_imus(assessed, misfit, noise_ratio))
     yield from noise
     if explained:
         if misfit.fits:
@@ -377,7 +379,8 @@ def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -
                 0.0,
             )
         return
-    if not noise or any(noise_ratio[f.kind] < 0.5 * excess(f) for f in misfit.fits if f.kind in INERTIAL):
+    inertial = [f for f in misfit.fits if f.kind in INERTIAL]
+    if not noise or any(noise_ratio[f.sensor, f.kind] < 0.5 * excess(f) for f in inertial):
         yield from _unknown(rig, assessed.estimate, misfit)
     for f in fits:
         if sentence := misfit_words(rig, f, _is_noise(assessed.estimate, f)):
@@ -393,32 +396,35 @@ def misfit_words(rig: Rig, f: SensorFit, is_noise: bool) -> Remark | None:
     return assessors()[sensor.sensor_type].misfit(sensor, f, is_noise)
 
 
-def _noise_of_imu(assessed: AssessedEstimate, misfit: Misfit, noise_ratio: Mapping[str, float]) -> Iterator[Cause]:
-    """Causes that are noise of the IMU, stated too small or too large. Another noise is advised only if the readings
+def _noise_of_imus(assessed: AssessedEstimate, misfit: Misfit, noise_ratio: Mapping[FitKey, float]) -> Iterator[Cause]:
+    """Causes that are noise of an IMU, stated too small or too large. Another noise is advised only if the readings
     show it by themselves. noise_ratio: see `_noise_over_stated`."""
-    imu, imu_fits = assessed.inputs.rig.imu, [f for f in assessed.fits if f.kind in INERTIAL]
-    if imu is None or not imu_fits:
-        return
-    small = [f for f in imu_fits if is_small(f)]
     overstated = tuple(s for a in assessments(assessed) for s in a.overstated_noise)
-    if any(noise_ratio[f.kind] > CLEARLY for f in imu_fits if excess(f) > 1.0 or not dof_known(f)):
-        scales = {kind: max(s, 1.0) for kind, s in noise_ratio.items()}
-        yield Cause(noise_words(imu, scales), misfit.chi2, misfit.is_grave)
-    elif overstated:  # the trajectory then follows the IMU, and its residuals become small
-        yield from (Cause(sentence, 0.0) for sentence in overstated)
-    elif small and all(noise_ratio[f.kind] < 1.0 / CLEARLY for f in small):
-        scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), noise_ratio[f.kind]) for f in small}
-        yield Cause(noise_words(imu, scales), 0.0)
-    elif small:
-        sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
-        yield Cause(
-            Remark(
-                "imu_residuals_small",
-                f"residuals of {imu.name} are smaller than the stated noise predicts ({sizes}); standard "
-                "deviations are too large, if anything.",
-            ),
-            0.0,
-        )
+    rig = assessed.inputs.rig
+    for imu in () if rig.imu is None else (rig.imu, *rig.further_imus):
+        fits = [f for f in assessed.fits if f.sensor == imu.name and f.kind in INERTIAL]
+        of_imu = {kind: noise_ratio[imu.name, kind] for kind in INERTIAL}
+        small = [f for f in fits if is_small(f)]
+        if any(of_imu[f.kind] > CLEARLY for f in fits if excess(f) > 1.0 or not dof_known(f)):
+            scales = {kind: max(s, 1.0) for kind, s in of_imu.items()}
+            yield Cause(noise_words(imu, scales), misfit.chi2, misfit.is_grave)
+        elif fits and overstated:  # the trajectory then follows the IMU, and its residuals become small
+            yield from (Cause(sentence, 0.0) for sentence in overstated)
+            return
+        elif small and all(of_imu[f.kind] < 1.0 / CLEARLY for f in small):
+            scales = dict.fromkeys(INERTIAL, 1.0) | {f.kind: max(ratio(f), of_imu[f.kind]) for f in small}
+            yield Cause(noise_words(imu, scales), 0.0)
+        elif small:
+            yield Cause(_small_words(imu, small), 0.0)
+
+
+def _small_words(imu: ImuSensor, small: Sequence[SensorFit]) -> Remark:
+    sizes = " and ".join(f"{f.kind} {ratio(f):.2g}x" for f in small)
+    return Remark(
+        "imu_residuals_small",
+        f"residuals of {imu.name} are smaller than the stated noise predicts ({sizes}); standard "
+        "deviations are too large, if anything.",
+    )
 
 
 def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> Remark:
@@ -465,14 +471,16 @@ def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
     )
 
 
-def _noise_over_stated(inputs: Inputs) -> dict[str, float]:
-    """By kind of INERTIAL: the noise density that the readings show in quiet moments over the stated one; NaN without
-    an IMU."""
-    if inputs.imu is None or inputs.rig.imu is None or inputs.rig.assumes_motion:
-        return dict.fromkeys(INERTIAL, np.nan)
-    imu, stated = inputs.imu, inputs.rig.imu.noise
-    of_kinds = zip(INERTIAL, (imu.gyro, imu.accel), (stated.gyro, stated.accel), strict=True)
-    return {kind: quiet_scatter(imu.seconds, x) / density for kind, x, density in of_kinds}
+def _noise_over_stated(inputs: Inputs) -> dict[FitKey, float]:
+    """By IMU and kind of INERTIAL: the noise density that the readings show in quiet moments over the stated one; NaN
+    for an assumed motion."""
+    ratios: dict[FitKey, float] = {}
+    for stream in inputs.measurements.of(ImuStream):
+        imu = inputs.sensor(stream.name)
+        of_kinds = zip(INERTIAL, (stream.gyro, stream.accel), (imu.noise.gyro, imu.noise.accel), strict=True)
+        for kind, x, density in of_kinds:
+            ratios[imu.name, kind] = np.nan if imu.assumed else quiet_scatter(stream.seconds, x) / density
+    return ratios
 
 
 def _is_noise(estimate: Estimate, f: SensorFit) -> bool:

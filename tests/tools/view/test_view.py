@@ -145,7 +145,7 @@ def test_lines_hold_what_the_result_holds(found, shown):
     lines, moments = rows.values["Scalars:scalars"], rows.seconds[np.isfinite(rows.seconds)]
     np.testing.assert_allclose(lines[int(np.argmin(np.abs(moments - r.seconds[k])))], [rms], rtol=1e-12)
     np.testing.assert_allclose(
-        found["residuals/imu0/velocity"].values["Scalars:scalars"], c.imu_residuals.whitened[:, 3:6], rtol=1e-12
+        found["residuals/imu0/velocity"].values["Scalars:scalars"], c.imu_residuals[0].whitened[:, 3:6], rtol=1e-12
     )
     np.testing.assert_allclose(
         found["readings/imu0/gyro"].values["Scalars:scalars"],

@@ -11,50 +11,72 @@ from icalib.base.remark import Remark
 from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
+from icalib.motion.imu_data import further_imu_data
 from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
+from icalib.sensors.imu.mounted_factor import USUAL_SPEED_M_S
 from icalib.sensors.imu.spec import INTRINSICS_LABELS, prior_words
 from icalib.sensors.imu.stream import ImuResiduals
 
 
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[ImuResiduals]:
-    """The residuals of all intervals between keyframes; intervals between two recordings have no data and are
-    omitted."""
+    """The residuals of each IMU in all intervals between keyframes; intervals between two recordings have no data and
+    are omitted."""
     if inputs.imu is None or inputs.rig.assumes_motion:
         return
     chain, state = estimate.problem.chain, estimate.outcome.state
     seconds = timeline.on_result_clock(state.seconds, state.recording)[:-1]
     between = np.array(chain.starts[1:], dtype=np.int64) - 1
-    whitened = estimate.outcome.residuals[chain.key].residual
-    yield ImuResiduals(chain.name, np.delete(seconds, between), np.delete(whitened, between, axis=0))
+    for name in (chain.name, *inputs.layout.further_imus):
+        whitened = estimate.outcome.residuals[name, "readings"].residual
+        yield ImuResiduals(name, np.delete(seconds, between), np.delete(whitened, between, axis=0))
 
 
-def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
-    """Notes on noise, the prior of the intrinsics and gaps; without an IMU, on the assumed smooth motion."""
-    imu = inputs.imu
-    if imu is None:
+def notes(inputs: Inputs, timeline: Timeline) -> Iterator[Remark]:
+    """Notes on noise, the prior of the intrinsics and gaps of each IMU; without one, on the assumed smooth motion."""
+    rig = inputs.rig
+    if inputs.imu is None or rig.imu is None:
         return
-    assert inputs.rig.imu is not None
-    n, most = inputs.rig.imu.noise, inputs.rig.settings.max_gap_s
-    if inputs.rig.assumes_motion:
+    if rig.assumes_motion:
+        n = rig.imu.noise
         yield Remark(
             "smooth_motion_assumed",
             f"there is no IMU: the motion is assumed to be smooth, in a second its rate to change by {n.gyro_walk:.2g} "
             f"rad/s and its acceleration by {n.accel_walk:.2g} m/s^2 (standard deviations of each axis).",
         )
         return
-    yield Remark(
-        "imu_noise_stated",
-        f"IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
-        f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}.",
-    )
-    if words := _intrinsics_words(inputs.rig.imu):
-        yield words
-    for a, b in imu.gaps:
-        how = "bridged" if b - a <= most else "left out, with the images in it"
-        yield Remark("imu_gap", f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}.")
+    for imu in (rig.imu, *rig.further_imus):
+        n, named = imu.noise, f"{imu.name}: " if rig.further_imus else ""
+        yield Remark(
+            "imu_noise_stated",
+            f"{named}IMU noise ({n.source}): gyro {n.gyro:.3g} rad/s/sqrt(Hz), walk {n.gyro_walk:.3g}; accelerometer "
+            f"{n.accel:.3g} m/s^2/sqrt(Hz), walk {n.accel_walk:.3g}.",
+        )
+        if words := _intrinsics_words(imu):
+            yield words.with_sentence(f"{named}{words}")
+    if rig.imus_alone:
+        yield Remark(
+            "imus_alone",
+            "there are IMUs only: how they move is not measured, and their speed is assumed to be "
+            f"{USUAL_SPEED_M_S:g} m/s (standard deviation of each axis).",
+        )
+    yield from _gaps(inputs, timeline)
+
+
+def _gaps(inputs: Inputs, timeline: Timeline) -> Iterator[Remark]:
+    """Notes on times without readings of an IMU."""
+    assert inputs.imu is not None
+    further = (further_imu_data(s, inputs.parts, inputs.measurements) for s in inputs.rig.further_imus)
+    for imu in (inputs.imu, *further):
+        for a, b in imu.gaps:
+            how = "left out, with the images in it"
+            if imu is not inputs.imu:
+                how = "left out of its readings"
+            elif b - a <= inputs.rig.settings.max_gap_s:
+                how = "bridged"
+            yield Remark("imu_gap", f"{imu.name} has a gap of {b - a:.3f} s at {timeline.words(a)}, {how}.")
 
 
 def _intrinsics_words(imu: ImuSensor) -> Remark | None:
@@ -106,7 +128,7 @@ def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     return Assessment(
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
+        notes=notes(a.inputs, a.timeline),
     )
 
 

@@ -197,7 +197,7 @@ def _capital(sentence: str) -> str:
 
 
 class ImuInspector(KindInspector):
-    """Finds IMUs, and drafts the rig file entry of the one to calibrate with."""
+    """Finds IMUs, and drafts their entries in the rig file."""
 
     sensor: ClassVar[type[Sensor]] = ImuSensor
     topic_kinds: ClassVar[tuple[str, ...]] = ("imu",)
@@ -236,7 +236,7 @@ class ImuInspector(KindInspector):
         return Facts(facts, StreamFacts(topic, timing_of(imu.stamps_ns), facts.problem))
 
     def draft(self, inspection: Inspection, active: bool) -> Draft:
-        """Lines of the IMU to calibrate with."""
+        """Lines of all IMUs, that of the body first."""
         return Draft(imu_lines(inspection, inspection.sources.of(self.sensor.sensor_type)))
 
     def figures(self, inspection: Inspection, name: str) -> dict[str, Any]:
@@ -252,15 +252,28 @@ class ImuInspector(KindInspector):
 INSPECTOR = ImuInspector()
 
 
-# Lines of an IMU in a draft of the rig file.
+# Lines of IMUs in a draft of the rig file.
 
 
 def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[str]:
-    """Lines of the IMU to calibrate with, among `imus` by name; none without any."""
-    if not imus:
-        return
-    name = inspection.imu or next(iter(imus))
-    topic, halves, facts = imus[name].topic, imus[name].halves, inspection.facts[name]
+    """Lines of the IMUs, that of the body first. Those that cannot be read, or are the same device as another one by
+    the frame in their messages, are named in a comment."""
+    frames: dict[str, str] = {}
+    for name in sorted(imus, key=lambda n: n != inspection.imu):
+        topic, facts = imus[name].topic, inspection.facts[name]
+        frame = facts.frame if facts else ""
+        if frames and (facts is None or facts.problem):
+            yield f"  # Also recorded, but not usable: {name} ({comment(topic.name)})."
+        elif frame and frame in frames:
+            yield f"  # Also recorded: {name} ({comment(topic.name)}), readings in the frame of {frames[frame]}."
+        else:
+            yield from _lines_of(inspection, name, imus[name], first=not frames)
+            frames[frame or name] = name
+
+
+def _lines_of(inspection: Inspection, name: str, source: ImuSource, first: bool) -> Iterator[str]:
+    """Lines of one IMU; first: it is the body."""
+    topic, halves, facts = source.topic, source.halves, inspection.facts[name]
     frame = facts.frame if facts else ""
     yield from (f"  {name}:", "    type: imu")
     yield "    " + place_line(topic.name, topic.type, frame) if halves is None else _places(halves, topic.type, frame)
@@ -269,13 +282,11 @@ def imu_lines(inspection: Inspection, imus: dict[str, ImuSource]) -> Iterator[st
     if facts and np.isfinite(facts.scatter).all():
         gyro, accel = facts.scatter
         yield f"    # Its readings in quiet moments show at least gyro: {gyro:.2g}, accel: {accel:.2g}."
-    yield "    # The most valuable line of this draft: how far axes and scales of this IMU may be off. Rotations and"
-    yield f"    # lengths depend on it. One of {', '.join(IMU_CLASSES)}; `fixed` if it is calibrated."
+    if first:
+        yield "    # The most valuable line of this draft: how far axes and scales of this IMU may be off. Rotations"
+        yield f"    # and lengths depend on it. One of {', '.join(IMU_CLASSES)}; `fixed` if it is calibrated."
     noise = class_noise(DEFAULT_CLASS) if kalibr is None else ImuNoise(**kalibr.densities, source="")
     yield f"    intrinsics: {class_of_noise(noise)}"
-    others = [f"{n} ({imu.topic.name})" for n, imu in imus.items() if n != name]
-    if others:
-        yield f"  # Also recorded: {comment(', '.join(others))}; a rig has one IMU, choose the best."
 
 
 def _noise(kalibr: KalibrImu | None) -> Iterator[str]:

@@ -69,8 +69,25 @@ class Increments(NamedTuple):
     bias0: np.ndarray
 
 
+def preintegrated(
+    imu: ImuData, seconds: np.ndarray, usable: np.ndarray, bias: np.ndarray, intrinsics: np.ndarray, n_intrinsics: int
+) -> Increments:
+    """The intervals between `seconds` (K,) on the IMU's clock, preintegrated at the biases (K, 6) and `intrinsics`
+    (24,), with Jacobians by n_intrinsics of these. Those that are not `usable` (K - 1,) have W = 0, and no motion."""
+    n = len(seconds) - 1
+    identity = np.tile(np.eye(3), (n, 1, 1))
+    sizes = (n, 9, 6 + n_intrinsics), (n, N_ROWS, N_ROWS)
+    arrays = identity, np.zeros((n, 3)), np.zeros((n, 3)), *(memory.mmap_zeros(size) for size in sizes)
+    first, readings = imu.interval(seconds[:-1]), readings_of(imu)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(int)))
+    runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist()]
+    halves = [(a, b) for begin, end in runs for a, b in ((begin, (begin + end) // 2), ((begin + end) // 2, end))]
+    in_parallel(lambda k: _preintegrate(*k, seconds, first, readings, bias, intrinsics, *arrays), halves)
+    return Increments(*arrays, bias)
+
+
 @njit(cache=True, nogil=True, inline="always")
-def _bias_correction(k, chain, increments, dx, change):
+def bias_correction(k, chain, increments, dx, change):
     """Fills change (9,), the first-order change of the increment of interval k since preintegration, from the changes
     of the biases and of the intrinsics dx (24 or 0,)."""
     for i in range(9):
@@ -82,7 +99,7 @@ def _bias_correction(k, chain, increments, dx, change):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _state_change(k, chain):
+def state_change(k, chain):
     """R_k^T R_k+1 (3, 3), and the changes of velocity [m/s] and position [m] (3,) over interval k, without initial
     velocity and gravity, in the axes of keyframe k."""
     R0, dt, g = chain.R[k], chain.seconds[k + 1] - chain.seconds[k], chain.gravity
@@ -99,7 +116,7 @@ def _state_change(k, chain):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _residual(k, chain, increments, change, R01, hv, hp, r):
+def fill_residual(k, chain, increments, change, R01, hv, hp, r):
     """Fills r (15,) = predicted - measured of interval k, not whitened."""
     error = so3.log(tmul3(so3.exp(change[:3]), tmul3(increments.dR[k], R01)))
     for i in range(3):
@@ -111,7 +128,7 @@ def _residual(k, chain, increments, change, R01, hv, hp, r):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
+def fill_jacobians(k, chain, increments, change, R01, hv, hp, r, J):
     """Fills J (15, 30 + 24 or 0, and more) of r by keyframe k, keyframe k + 1 and intrinsics. The caller has set the
     constant entries, zeros and the 1 and -1 of the biases."""
     Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
@@ -138,7 +155,7 @@ def _jacobians(k, chain, increments, change, R01, hv, hp, r, J):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _last_column(k, chain, unit, r, J):
+def fill_last_column(k, chain, unit, r, J):
     """Fills the last column of J: by gravity where there is some; by the unit of length of an assumed motion, which has
     none."""
     dt, last = chain.seconds[k + 1] - chain.seconds[k], J.shape[1] - 1
@@ -165,9 +182,9 @@ def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
     with_sums = len(sums.diagonal) > 0
     cost = 0.0
     for k in range(sums.first, k1):
-        R01, hv, hp = _state_change(k, chain)
-        _bias_correction(k, chain, increments, dx, change)
-        _residual(k, chain, increments, change, R01, hv, hp, r)
+        R01, hv, hp = state_change(k, chain)
+        bias_correction(k, chain, increments, dx, change)
+        fill_residual(k, chain, increments, change, R01, hv, hp, r)
         for i in range(N_ROWS):
             s = 0.0
             for m in range(i + 1):
@@ -176,9 +193,9 @@ def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
             out[k, i] = whitened[i, width] = s
             cost += 0.5 * s * s
         if with_sums:
-            _jacobians(k, chain, increments, change, R01, hv, hp, r, J)
+            fill_jacobians(k, chain, increments, change, R01, hv, hp, r, J)
             if len(columns) > len(dx):
-                _last_column(k, chain, unit, r, J)
+                fill_last_column(k, chain, unit, r, J)
             whiten(W, J, whitened)
             add_product(k - sums.first, KEYFRAME_PAIR_DIM, width, whitened, whitened, columns, sums)
     return cost
@@ -247,31 +264,14 @@ class ImuFactor(RowFactor):
         cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray, gravity_column: np.ndarray = NONE
     ) -> ImuFactor:
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
-        n = len(state.seconds) - 1
-        width = 6 + len(columns) - (imu.unit is not None)
-        arrays = (
-            np.empty((n, 3, 3)),
-            np.empty((n, 3)),
-            np.empty((n, 3)),
-            memory.mmap_zeros((n, 9, width)),
-            memory.mmap_zeros((n, N_ROWS, N_ROWS)),
-        )
-        bias0 = state.bias.copy()
-        intrinsics = state.values[imu.name, "intrinsics"].copy()
-        first = imu.interval(state.seconds[:-1])
-        half = n // 2
-        in_parallel(
-            lambda ks: _preintegrate(
-                ks[0], ks[1], state.seconds, first, readings_of(imu), bias0, intrinsics, *arrays
-            ),
-            [(0, half), (half, n)],
-        )  # fmt: skip
+        bias0, intrinsics = state.bias.copy(), state.values[imu.name, "intrinsics"].copy()
         seams = np.array(state.starts[1:], dtype=np.int64) - 1
-        dR, _, _, _, W = arrays
-        W[seams] = 0.0
+        n_intrinsics = len(columns) - (imu.unit is not None)
+        usable = ~np.isin(np.arange(len(state.seconds) - 1), seams)
+        increments = preintegrated(imu, state.seconds, usable, bias0, intrinsics, n_intrinsics)
         # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
-        dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
-        return cls(imu, gravity, columns, gravity_column, Increments(*arrays, bias0), intrinsics, state.starts)
+        increments.dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
+        return cls(imu, gravity, columns, gravity_column, increments, intrinsics, state.starts)
 
     def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
         return ImuFactor.build(imu, state, self.gravity, self.columns, self.gravity_column)

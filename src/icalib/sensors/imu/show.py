@@ -19,10 +19,12 @@ _WORDS = (
 
 
 def sections(c: Calibration) -> Iterator[Section]:
-    """The section with the residuals of the intervals between keyframes."""
-    if c.imu is not None:
-        figures = {"imu-residuals": _residual_figure(c.imu_residuals)}
-        yield Section("inertial", "IMU residuals", _WORDS, plot_place("imu-residuals"), figures)
+    """A section for each IMU, with the residuals of the intervals between keyframes."""
+    for k, residuals in enumerate(c.imu_residuals):
+        title = f"Residuals of {residuals.sensor}" if len(c.imu_residuals) > 1 else "IMU residuals"
+        place = f"imu-residuals-{k}" if k else "imu-residuals"
+        figures = {place: _residual_figure(residuals)}
+        yield Section(f"inertial-{k}" if k else "inertial", title, _WORDS, plot_place(place), figures)
 
 
 def _residual_figure(r: ImuResiduals) -> Figure:

@@ -15,11 +15,12 @@ from icalib.sensors.fields import (
     choice_or,
     layout_to_plain,
     parameter_to_plain,
+    parameters,
     table_layout,
     vector_parameter,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
-from icalib.sensors.sensor import PLAIN_TABLE, Axes, Sampling, Sensor, TableLayout
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, MountedSensor, Sampling, TableLayout
 
 
 @dataclass(frozen=True)
@@ -149,11 +150,14 @@ BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs f
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
+_MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
 
 
 @dataclass(frozen=True)
-class ImuSensor(Sensor):
+class ImuSensor(MountedSensor):
     """An IMU.
+
+    mounted: set by `Rig`; False for the IMU that is the body, which has neither extrinsics nor a time offset.
 
     Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
     sampling: `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
@@ -166,6 +170,7 @@ class ImuSensor(Sensor):
     noun: ClassVar[str] = "IMU"
     is_inertial: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
+        *MOUNTED,
         ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1),
     )
 
@@ -181,6 +186,7 @@ class ImuSensor(Sensor):
     assumed: bool = False
     pose_keyframes_s: float = 0.02  # interval between keyframes if the motion is determined by poses alone
     layout: TableLayout = PLAIN_TABLE
+    mounted: bool = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -190,16 +196,21 @@ class ImuSensor(Sensor):
             start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
             object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
 
+    def specs(self) -> tuple[ParameterSpec, ...]:
+        """See `Sensor`; extrinsics and time offset only where `mounted`."""
+        return self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
+
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> ImuSensor:
-        names = [spec.name for spec in cls.stated()]
-        fields = value.record(("type",), ("path", "topic", "noise", *names, *_FIELDS, *TABLE))
+        fields = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_FIELDS, *TABLE, *_MOUNT))
         units: dict[str, Any] = {
             field: fields[field].choice("such unit as", get_args(kind))
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups: dict[str, Any] = {name: _intrinsics(fields[name]) for name in names if name in fields}
+        groups = parameters(fields, MOUNTED)
+        if "intrinsics" in fields:
+            groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(
             name=name,
             path=_source(fields["path"]) if "path" in fields else f"{name}/data.csv",
@@ -223,7 +234,8 @@ class ImuSensor(Sensor):
             given = getattr(self, field)
             if given is not None:
                 plain[field] = list(given) if isinstance(given, tuple) else given
-        groups = {spec.name: getattr(self, spec.name) for spec in self.stated()}
+        plain |= {"clock_restarts": True} if self.clock_restarts else {}
+        groups = {spec.name: getattr(self, spec.name) for spec in self.specs()}
         ideal = [name for name, p in groups.items() if p.mode == "fixed" and p.value is None]
         return plain | {name: "fixed" if name in ideal else parameter_to_plain(p) for name, p in groups.items()}
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.base.files import regular
 from icalib.errors import RecordingError
+from icalib.rig import ImuNoise
 from icalib.tools.simulation.scenario import GRAVITY_WORLD, HandheldMotion, Interval, Scenario
 from icalib.tools.simulation.trajectory import Jet, Rows, TrueTrajectory, Vector, matrices, values
 
@@ -385,18 +386,40 @@ def rotation_from_vector(vector: np.ndarray) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
 
 
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Errors of an IMU: noise, and whether it is on; rate [Hz]; biases (6,) at the first reading [rad/s, m/s^2];
+    intrinsics (24,), see `Scenario`."""
+
+    noise: ImuNoise
+    noisy: bool
+    rate_hz: float
+    bias: tuple[float, ...]
+    intrinsics: np.ndarray
+
+
 def read_imu(scenario: Scenario, seconds: np.ndarray, true: np.ndarray, rng: np.random.Generator) -> ImuReadings:
+    """Readings of the first IMU, see `readings_with_errors`."""
+    bias = (*scenario.gyro_bias, *scenario.accel_bias)
+    noise, noisy = scenario.imu_noise, scenario.imu_noise_enabled
+    errors = Errors(noise, noisy, scenario.imu_rate_hz, bias, scenario.imu_intrinsics)
+    return readings_with_errors(errors, seconds, true, rng)
+
+
+def readings_with_errors(
+    errors: Errors, seconds: np.ndarray, true: np.ndarray, rng: np.random.Generator
+) -> ImuReadings:
     """Readings with bias and noise of true angular rates [rad/s] and specific forces [m/s^2] (N, 6) at seconds (N,).
 
     A noise density d gives each reading the standard deviation d sqrt(rate). A walk density w adds w sqrt(dt) N(0, 1)
     to the bias from one reading to the next.
     """
-    noise = scenario.imu_noise
-    white, steps = rng.standard_normal((2, len(seconds), 6)) * float(scenario.imu_noise_enabled)
-    white *= np.sqrt(scenario.imu_rate_hz) * np.repeat([noise.gyro, noise.accel], 3)
+    noise = errors.noise
+    white, steps = rng.standard_normal((2, len(seconds), 6)) * float(errors.noisy)
+    white *= np.sqrt(errors.rate_hz) * np.repeat([noise.gyro, noise.accel], 3)
     steps *= np.repeat([noise.gyro_walk, noise.accel_walk], 3)
     steps[0] = 0.0
     steps[1:] *= np.sqrt(np.diff(seconds))[:, None]
-    bias = np.concatenate([scenario.gyro_bias, scenario.accel_bias]) + np.cumsum(steps, axis=0)
-    reading = distort(scenario.imu_intrinsics, true) + bias + white
+    bias = np.array(errors.bias) + np.cumsum(steps, axis=0)
+    reading = distort(errors.intrinsics, true) + bias + white
     return ImuReadings(reading[:, :3], reading[:, 3:], bias[:, :3], bias[:, 3:])

@@ -55,11 +55,11 @@ class BagWriter:
         height, width = pixels.shape
         return self.make(IMAGE, self.header(stamp_ns, frame), height, width, "mono8", 0, width, pixels.ravel())
 
-    def imu(self, stamp_ns: int, values: list[float]) -> Any:
+    def imu(self, stamp_ns: int, values: list[float], name: str = "imu0") -> Any:
         """Imu message; values (6): gyro [rad/s], accel [m/s^2]. Orientation and covariances are left unknown."""
         unknown, turn = np.zeros(9), self.make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
         w, f = (self.make("geometry_msgs/msg/Vector3", *v) for v in (values[:3], values[3:]))
-        return self.make(IMU, self.header(stamp_ns, "imu0"), turn, unknown, w, unknown, f, unknown)
+        return self.make(IMU, self.header(stamp_ns, name), turn, unknown, w, unknown, f, unknown)
 
     def header(self, stamp_ns: int, frame: str) -> Any:
         """Header of a message, with stamp and frame id."""

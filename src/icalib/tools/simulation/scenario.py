@@ -579,6 +579,13 @@ def mounted_fields(
     return fields, common
 
 
+def imu_noise(value: YamlValue) -> ImuNoise:
+    """The noise densities of an IMU."""
+    names = ("gyro", "gyro_walk", "accel", "accel_walk")
+    densities = value.record(names)
+    return ImuNoise(**{name: densities[name].positive() for name in names}, source="scenario")
+
+
 def at_least(value: YamlValue, least: float) -> float:
     number = value.number()
     if number < least:

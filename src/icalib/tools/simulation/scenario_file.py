@@ -15,7 +15,6 @@ from icalib.base.yaml_nodes import LARGEST_INTEGER, YamlValue, read_yaml
 from icalib.errors import RigError
 from icalib.geometry.targets import TARGETS, AprilGrid, Markers, Scene, Target
 from icalib.kinds import simulated_kinds
-from icalib.rig import ImuNoise
 from icalib.sensors import SENSOR_KINDS
 from icalib.sensors.fields import choice_or
 from icalib.tools.simulation.projection import PARAMETER_COUNTS
@@ -29,6 +28,7 @@ from icalib.tools.simulation.scenario import (
     SimSensor,
     at_least,
     handheld,
+    imu_noise,
     intervals,
     mounted_fields,
     pose,
@@ -39,7 +39,6 @@ from icalib.tools.simulation.scenario import (
 )
 from icalib.tools.simulation.trajectory import Drive, DriveKind, Features
 
-_DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _START_NS = 1_700_000_000_000_000_000  # origin of all clocks if the file gives none
 _MARGIN_S = 3600.0  # largest difference between clocks of sensors
 _STEEPEST_DEG = 45.0
@@ -106,24 +105,21 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
         if "type" not in fields:
             sensor.fail(f"type is missing; add type: {' or type: '.join(types)}.")
         kind = fields["type"].choice("sensor type", types)
-        if kind == "imu":
-            imus.append(_imu(name, sensor))
+        if kind == "imu" and name == "imu0":
+            imus.append(_imu(sensor))
         elif kind == "camera":
             cameras.append(_camera(name, sensor, start_ns))
         else:
             others.append(kinds[kind].parse(name, sensor, start_ns))
-    if len(imus) != 1:
-        value.fail(f"there must be one sensor of type: imu, not {len(imus)}; its frame is the robot's.")
+    if not imus:
+        value.fail("there is no imu0 of type: imu, whose frame is the robot's; add it.")
     others.sort(key=lambda sensor: types.index(sensor.sensor_type))
     return imus[0] | {"cameras": tuple(cameras), "sensors": tuple(others)}
 
 
-def _imu(name: str, value: YamlValue) -> dict[str, Any]:
-    if name != "imu0":
-        value.fail("the IMU must be called imu0; rename it.")
+def _imu(value: YamlValue) -> dict[str, Any]:
     fields = value.record(("type", "rate", "noise"), ("gyro_bias", "accel_bias", "sampling"))
-    densities = fields["noise"].record(_DENSITIES)
-    noise = ImuNoise(**{name: densities[name].positive() for name in _DENSITIES}, source="scenario")
+    noise = imu_noise(fields["noise"])
     biases = {key: tuple(fields[key].vector(3).tolist()) for key in ("gyro_bias", "accel_bias") if key in fields}
     sampling = choice_or(fields, "sampling", ImuSampling, Scenario.imu_sampling)
     return {"imu_rate_hz": fields["rate"].positive(), "imu_noise": noise, "imu_sampling": sampling} | biases

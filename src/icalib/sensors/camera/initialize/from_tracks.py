@@ -31,6 +31,7 @@ from icalib.geometry.cameras import camera_model
 from icalib.initialize.initializer import merged_value
 from icalib.initialize.rate_alignment import RateAlignment
 from icalib.initialize.rate_correlation import GyroRotation
+from icalib.initialize.trajectories import levelling_rotation
 from icalib.motion.imu_data import ImuData, imu_data
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.initialize.guess import (
@@ -220,7 +221,7 @@ class WindowMotion:
         rotation, position = np.empty((len(t), 3, 3)), np.empty((len(t), 3))
         origin, R = np.zeros(3), self.gyro.at(t)
         for k in range(len(self.begins)):
-            R_world_start, rows = _levelling_rotation(self.gravity[k]), window == k
+            R_world_start, rows = levelling_rotation(self.gravity[k]), window == k
             rotation[rows] = R_world_start @ R[rows]
             position[rows] = origin + self.within(k, t[rows]) @ R_world_start.T
             if k + 1 < len(self.begins):
@@ -390,11 +391,3 @@ class _Window:
         redundancy = max(1.0, len(range_m) / MAX_INDEPENDENT_RAYS)
         sigma, scale = np.sqrt(redundancy) * max(WINDOW_RAY_SIGMA, typical), 3.0 * typical + 1e-12
         return 1.0 / ((sigma * range_m) ** 2 * (1.0 + (error / scale) ** 2))
-
-
-def _levelling_rotation(gravity: np.ndarray) -> np.ndarray:
-    """R_world_start (3, 3): the smallest rotation that maps the direction of `gravity` (3,) to -z."""
-    d = -gravity / np.linalg.norm(gravity)
-    axis = np.cross(d, [0.0, 0.0, 1.0])
-    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    return np.eye(3) + K + K @ K / (1.0 + d[2])
