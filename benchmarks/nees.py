@@ -1,6 +1,6 @@
 """Are standard deviations as large as errors? NEES of many short simulated recordings, by kind of sensor.
 
-python benchmarks/nees.py [--first-seed N] [--rounds N] [--without-imu MINUTES]
+python benchmarks/nees.py [--first-seed N] [--rounds N] [--without-imu MINUTES] [--imus]
 
 A round is what tests/consistency/test_sigmas.py runs, with other seeds. The mean normalised estimation error squared
 (NEES) per degree of freedom is printed, and the bounds within which it is where standard deviations are honest.
@@ -8,6 +8,9 @@ A round is what tests/consistency/test_sigmas.py runs, with other seeds. The mea
 With --without-imu, wheels beside motion capture and wheels beside a camera are calibrated for that long instead, five
 seeds each. True scales are drawn from their priors. Nothing else shows a length, so that each estimated scale is 1. The
 NEES is that of the wheels' radii and baseline.
+
+With --imus, rigs of two and three IMUs, from nothing, 40 s each, 30 seeds: beside a camera and a board, and alone. The
+root mean square of each error is printed, too.
 """
 
 from __future__ import annotations
@@ -24,12 +27,14 @@ import numpy as np
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import PoseSensor, Rig
+from icalib.sensors.imu.simulate import SimImu
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
+from icalib.tools.simulation.motion import rotation_from_vector
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 WALL_GRID = AprilGrid(4, 10, 0.6, 0.3)
@@ -143,12 +148,40 @@ def _imu(rate_hz: float) -> Case:
     return Case(scenario, rig_for(scenario), 30)
 
 
+def imus(number: int, seconds: float, camera: bool) -> Scenario:
+    """IMUs of a data sheet moved by hand, 15 and 27 cm from the first one, with clocks of their own; with or without a
+    camera in front of a target."""
+    scenario = handheld(seconds)
+    clock = scenario.imu_clock_origin_ns
+    further = (
+        SimImu("imu1", _turned([0.5, -1.2, 0.8], [0.12, -0.08, 0.05]), 0.0123, 400.0, 0.0007, clock),
+        SimImu("imu2", _turned([-0.9, 0.4, 2.0], [-0.2, 0.1, 0.15]), -0.0051, 1000.0, 0.0003, clock),
+    )
+    cameras = scenario.cameras[:1] if camera else ()
+    return replace(scenario, cameras=cameras).with_sensors(*further[: number - 1])
+
+
+def _turned(vector: list[float], position: list[float]) -> np.ndarray:
+    """(4, 4) pose with this rotation vector [rad] and position [m]."""
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_from_vector(np.array(vector)), position
+    return T
+
+
+def _imus() -> Case:
+    """A camera, a target and three IMUs."""
+    scenario = imus(3, 3.0, camera=True)
+    scenario = replace(scenario, cameras=tuple(replace(c, rate_hz=10.0) for c in scenario.cameras))
+    return Case(scenario, rig_for(scenario), 20, ("imu",))
+
+
 RATES_HZ = (100, 200, 400, 1000)
 CASES: dict[str, Callable[[], Case]] = {
     "board": _board,
     "tracks": _tracks,
     "drive": _drive,
     "poses": _poses,
+    "imus": _imus,
     **{f"imu at {rate} Hz": partial(_imu, float(rate)) for rate in RATES_HZ},
 }
 CHECKS = sum(len(make().kinds) + 1 for make in CASES.values())
@@ -183,6 +216,22 @@ def _judged(kind: str, runs: list[tuple[RunRecord, np.ndarray]]) -> Judged:
     normalised = [sample.error / np.sqrt(np.diag(sample.covariance)) for sample in by_printed]
     bias = float(np.abs(np.mean(normalised, axis=0)).max() * np.sqrt(len(runs)))
     return Judged(kind, dof, nees(by_covariance, probability), nees(by_printed, probability), bias)
+
+
+def check_imus(seeds: range) -> int:
+    """Prints NEES and errors of rigs with several IMUs. Returns the number of checks that failed."""
+    failed = 0
+    for number, camera in ((2, True), (3, True), (3, False)):
+        scenario = imus(number, 40.0, camera)
+        case = Case(scenario, rig_for(scenario), len(seeds))
+        runs = [_run(case, seed) for seed in seeds]
+        found = _judged(TOGETHER, runs)
+        failed += not found.consistent
+        print(f"{number} IMUs{', a camera' if camera else ' alone'}: {found}", flush=True)
+        for block in runs[0][0].blocks:
+            errors = np.array([record.error[record.columns(block.key)] for record, _ in runs])
+            print(f"  {block.key}: RMS {np.sqrt((errors**2).sum(axis=1).mean()):.2g}", flush=True)
+    return failed
 
 
 def scenarios_without_imu(seconds: float) -> dict[str, Scenario]:
@@ -239,7 +288,10 @@ def main() -> int:
     parser.add_argument("--first-seed", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--without-imu", type=float, metavar="MINUTES")
+    parser.add_argument("--imus", action="store_true")
     options = parser.parse_args()
+    if options.imus:
+        return min(check_imus(range(options.first_seed, options.first_seed + 30)), 1)
     if options.without_imu is not None:
         return min(check_without_imu(options.without_imu, range(options.first_seed, options.first_seed + 5)), 1)
     failed = 0

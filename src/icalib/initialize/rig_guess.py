@@ -111,9 +111,10 @@ def _on_assumed_motion(
     sensor stands for it. Raises `failed` if they do not show it either."""
     imu = inputs.rig.imu
     assert imu is not None
-    others = [m.without(imu.name) for m in recordings]
+    names = [s.name for s in (imu, *inputs.rig.further_imus)]
+    others = [m.without(*names) for m in recordings]
     try:
-        assumed, state, _ = guess_with_assumed_motion(inputs.rig.without(imu.name), others)
+        assumed, state, _ = guess_with_assumed_motion(inputs.rig.without(*names), others)
         posed, rig = [], inputs.rig.only(imu.name).with_sensors(pose_sensor_for(ASSUMED_POSES))
         for m, without, k, part in zip(recordings, others, state.recordings, assumed.parts, strict=True):
             stamps = without.origin_ns + np.round(1e9 * (state.seconds[k] - part.begin)).astype(np.int64)

@@ -178,10 +178,10 @@ class RelativePose:
 
 
 def relative_poses(c: Calibration) -> tuple[RelativePose, ...]:
-    """Relative poses of all pairs of sensors with a lens, and of all pairs of mounted sensors of different types."""
-    kinds = {name: sensor["type"] for name, sensor in c.rig["sensors"].items()}
+    """Relative poses of all pairs of mounted sensors, those of two cameras first."""
+    lenses = set(c.lenses)
     pairs = list(combinations(c.lenses, 2))
-    pairs += [(a, b) for a, b in combinations(c.mounted, 2) if kinds[a] != kinds[b]]
+    pairs += [(a, b) for a, b in combinations(c.mounted, 2) if not {a, b} <= lenses]
     return tuple(relative_pose(c, frame, sensor) for frame, sensor in pairs)
 
 
