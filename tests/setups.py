@@ -45,6 +45,7 @@ TOLERANCE = {
     "translation": 5e-3,
     "time_offset": 1e-3,
     "intrinsics": 1.0,
+    "size_effect": 1e-3,
     "distortion": 1e-2,
     "tilt": 2e-3,
     "shape": 1e-3,

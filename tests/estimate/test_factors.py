@@ -38,7 +38,7 @@ from icalib.rig import Ground, Loss, Scheme
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
-from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.imu.residual import ImuFactor, free_columns
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
@@ -84,12 +84,20 @@ def with_gravity(setup):
     return replace(setup, layout=layout, state=replace(setup.state, values=values))
 
 
-def imu_sample(unlike, setup_of, imu_free, unit=False):
+def with_size_effect(setup):
+    """The setup with the places of the accelerometer's axes estimated."""
+    entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    layout = make_layout([*entries, ("imu0", "size_effect", "nuisance", 6, True)])
+    values = setup.state.values | {("imu0", "size_effect"): np.arange(6) * 1e-3}
+    return replace(setup, layout=layout, state=replace(setup.state, values=values))
+
+
+def imu_sample(unlike, setup_of, imu_free, unit=False, places=False):
     """Preintegrated at another state, so that the corrections by bias and intrinsics are not zero."""
     setup = setup_of(unlike, imu_free=imu_free, size=unit)
     setup = in_unit(setup) if unit else with_gravity(setup)
-    columns = setup.layout.columns("imu0", "intrinsics")
-    columns = np.concatenate([columns[columns >= 0], setup.imu.unit_columns(setup.layout)])
+    setup = with_size_effect(setup) if places else setup
+    columns = np.concatenate([free_columns(setup.layout, "imu0"), setup.imu.unit_columns(setup.layout)])
     last = setup.layout.columns("world", "gravity") if not unit else columns[:0]
     factor = ImuFactor.build(setup.imu, setup.state, 0.0 if unit else 9.81, columns, last)
     state = setup.perturbed(np.random.default_rng(0), 0.1)
@@ -115,7 +123,8 @@ def with_further_imus(setup, number):
         entries += [(name, "time_offset", "vector", 1, True), (name, "intrinsics", "vector", 24, True)]
         values |= {(name, "rotation"): so3.exp(np.array([0.1, -0.2, 0.15]) * (k + 1.0))}
         values |= {(name, "translation"): np.array([0.1, 0.05, -0.08]), (name, "time_offset"): np.array([2e-3])}
-        values |= {(name, "intrinsics"): np.full(24, 1e-3)}
+        entries += [(name, "size_effect", "vector", 6, True)]
+        values |= {(name, "intrinsics"): np.full(24, 1e-3), (name, "size_effect"): np.arange(6) * 1e-3}
     old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     own = np.random.default_rng(3).normal(size=(len(setup.state.seconds), 9 * number)) * 0.05
     state = replace(setup.state, values=setup.state.values | values, further_imus=own)
@@ -647,6 +656,7 @@ def position_sample(
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
+    "imu, size effect": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True, places=True)),
     "imu, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False, unit=True)),
     "imu, intrinsics, unit of length": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True, unit=True)),
     "mounted imu": ("MountedImuFactor", lambda u, s, f: mounted_imu_sample(u, s, False)),

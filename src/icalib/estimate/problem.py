@@ -15,7 +15,7 @@ from icalib.estimate.inputs import UNGUESSED_TRANSLATION_SIGMA_M, Inputs, origin
 from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, by_kind, model_of
 from icalib.motion.factor import Factor, FactorKey, IndependentKeyframes, Residuals, Whitened, keyed
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import ImuData, at_one_place
 from icalib.motion.poses import (
     RECORDING_MARGIN_S,
     EstimatedMotion,
@@ -306,8 +306,9 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     the state is returned as it is."""
     if inputs.imu is None:
         return state
+    motion = motion_of(inputs, state)
     near = assign_keyframes("inertial", state.seconds, keyframes, inputs.imu.forwards)
-    poses = poses_at("inertial", keyframes, near, state, inputs.imu, gravity_of(state, inputs.rig.gravity), False)
+    poses = poses_at("inertial", keyframes, near, state, motion.imu, motion.gravity, False)
     starts, state = first_keyframes(inputs.imu, keyframes), with_further_imus(inputs, state)
     return State(
         keyframes, poses.rotation, poses.position, poses.velocity, state.bias[near].copy(), state.values, starts,
@@ -372,7 +373,8 @@ def assemble(
 def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
     """Motion of the IMU between the keyframes of `state`."""
     assert inputs.imu is not None
-    return EstimatedMotion(state, inputs.imu, gravity_of(state, inputs.rig.gravity), inputs.rig.settings.max_gap_s)
+    imu = at_one_place(inputs.imu, state, state.bias[:, :3].mean(axis=0))
+    return EstimatedMotion(state, imu, gravity_of(state, inputs.rig.gravity), inputs.rig.settings.max_gap_s)
 
 
 def _measured(inputs: Inputs, noise: Mapping[str, Any], at: Pass) -> list[Factor]:

@@ -142,13 +142,19 @@ def _lens_fields(lens: CameraParameters) -> dict[str, Any]:
 
 def _intrinsics(c: Calibration, imu: str) -> dict[str, Any]:
     """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, of w and f in the axes of the
-    accelerometer; empty if the IMU is assumed ideal."""
-    x = imu_values(c, imu)
-    if not x.any():
+    accelerometer, and the places of its axes where they are estimated; empty if the IMU is assumed ideal."""
+    x, size = imu_values(c, imu), c.group_or_none(imu, "size_effect")
+    if not x.any() and size is None:
         return {}
+    turned = _T_imu_kalibr(c, imu)[:3, :3].T
+    places = () if size is None else (np.zeros(3), size.value[:3], size.value[3:])
+    names = (f"r{axis}_i" for axis in "xyz")
     return {
-        "model": "scale-misalignment",
-        "accelerometers": {"M": lower(x[:6]).tolist()},
+        "model": "scale-misalignment" if size is None else "scale-misalignment-size-effect",
+        "accelerometers": {
+            "M": lower(x[:6]).tolist(),
+            **{name: (turned @ r).tolist() for name, r in zip(names, places, strict=False)},
+        },
         "gyroscopes": {
             "M": lower(x[6:12]).tolist(),
             "A": x[15:].reshape(3, 3).tolist(),

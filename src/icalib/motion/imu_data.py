@@ -294,6 +294,32 @@ def correction_matrices(intrinsics):
     return F, G, -mul3(GA, F), GA
 
 
+# Size effect: each axis of an accelerometer is at a place of its own. The IMU frame has its origin at the x axis; the
+# y and z axes are at r_y and r_z [m], so that axis i reads e_i (f + dw/dt x r_i + w x (w x r_i)).
+
+N_SIZE_EFFECT = 6  # r_y, then r_z
+
+
+def size_effect_matrix(imu: ImuData, gyro_bias: np.ndarray) -> np.ndarray:
+    """(N, 3, 6) derivative of the accelerometer's readings by r_y and r_z [1/s^2]. gyro_bias (3,) rad/s."""
+    w, C = np.ascontiguousarray(imu.gyro - gyro_bias), np.zeros((len(imu.gyro), 3, N_SIZE_EFFECT))
+    slope = np.gradient(w, imu.seconds, axis=0)
+    for begin, end in (*imu.gaps, *imu.seams):  # differences across a gap say nothing
+        slope[(imu.seconds >= begin) & (imu.seconds <= end)] = 0.0
+    W = so3.hat_many(w)
+    A = so3.hat_many(np.ascontiguousarray(slope)) + W @ W
+    C[:, 1, :3], C[:, 2, 3:] = A[:, 1], A[:, 2]
+    return C
+
+
+def at_one_place(imu: ImuData, state: State, gyro_bias: np.ndarray) -> ImuData:
+    """The readings that the accelerometer would have with all axes at the origin, by the size effect in `state`."""
+    places = state.values.get((imu.name, "size_effect"))
+    if places is None:
+        return imu
+    return replace(imu, accel=imu.accel - size_effect_matrix(imu, gyro_bias) @ places)
+
+
 # Sentences for messages: axes about which a body rotated, and about which it hardly did.
 
 # RMS rate about an axis over that about the strongest one: below it, rotation about the axis is too weak

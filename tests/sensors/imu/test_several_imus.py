@@ -68,6 +68,25 @@ def test_without_noise_the_truth_is_found():
         assert np.abs(off["time_offset"]).max() < 1e-7
 
 
+SIZE = (2e-3, -1e-3, 3e-3, -2e-3, 1.5e-3, 1e-3)
+
+
+@pytest.mark.parametrize("body", ["", "imu1"])
+def test_each_axis_of_an_accelerometer_at_a_place_of_its_own(body):
+    """Found without noise, whether the IMU is the body or mounted on it; left out, it would move the IMU."""
+    made = scenario(3.0, noiseless=True)
+    made = made.with_sensors(replace(made.of(SimImu)[0], size_effect=SIZE))
+    simulation = simulate(replace(made, sensors=made.sensors[:1]), seed=1)
+    rig = replace(rig_for(simulation.scenario), body=body).with_(
+        "imu1", size_effect=Parameter("prior", np.zeros(6), np.ones(6))
+    )
+    found = calibrate_measurements(rig, simulation.measurements)
+    np.testing.assert_allclose(found.group("imu1", "size_effect").value, SIZE, rtol=0, atol=1e-5)
+    if not body:
+        assert np.abs(errors(found, simulation, "imu1")["translation"]).max() < 1e-5
+        assert "scale-misalignment-size-effect" in export(found, "kalibr").files["imu.yaml"]
+
+
 def test_errors_are_within_standard_deviations_and_residuals_as_stated(result, recorded):
     assert result.converged
     for name in ("imu1", "imu2"):

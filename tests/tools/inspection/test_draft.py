@@ -314,7 +314,7 @@ def test_kalibrs_noise_of_another_imu(draft, bags, tmp_path):
     fill(path)
     rig = load_rig(path)
     assert (not_none(rig.imu).name, not_none(rig.imu).noise.gyro) == ("imu1", 1.87e-4)
-    assert [imu.name for imu in rig.further_imus] == ["imu0"]
+    assert "Also recorded: imu0 (/imu0), readings in the frame of imu1." in text
 
 
 def test_depth_images_and_odd_topics(draft, bags):

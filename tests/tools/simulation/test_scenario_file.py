@@ -172,7 +172,7 @@ BAD = {
         ("axis_imu: [0, 0, 0], kind: single-axis", "motion.axis_imu: must not be zero"),
     ],
     "sideslip_deg: 0.5": [("sideslip_deg: -1", "motion.sideslip_deg: must be at least 0, but is -1")],
-    "  imu0:": [("  imu1:", "must be called imu0")],
+    "  imu0:": [("  imu1:", "sensors.imu1: T_imu_sensor is missing")],
     "type: imu": [
         ("type: immu", "sensors.imu0.type: there is no sensor type 'immu', did you mean 'imu'"),
         ("kind: imu", "sensors.imu0: type is missing; add type: imu or type: camera"),
@@ -235,7 +235,7 @@ def test_no_file_and_no_imu(tmp_path):
     with pytest.raises(RigError, match="is empty; give a scenario file"):
         loaded(tmp_path, "")
     begin, end = FULL.index("  imu0:"), FULL.index("  left:")
-    with pytest.raises(RigError, match="sensors: there must be one sensor of type: imu, not 0"):
+    with pytest.raises(RigError, match="sensors: there is no imu0 of type: imu"):
         loaded(tmp_path, FULL[:begin] + FULL[end:])
 
 

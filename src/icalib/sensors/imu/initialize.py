@@ -49,7 +49,6 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import first_keyframes
 from icalib.optim.state import State
 from icalib.rig import ImuSensor, Rig
-from icalib.sensors.imu.spec import N_INTRINSICS
 from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 STEP_S = 0.02  # s: over which readings are averaged; motion by hand changes more slowly
@@ -96,8 +95,10 @@ class ImuInitializer(Initializer[ImuSensor]):
     def place(self, inputs: Inputs, state: State, sensors: Sequence[ImuSensor]) -> Values:
         out: Values = {}
         for sensor in sensors:
-            stated, intrinsics = stated_values(inputs, sensor), sensor.intrinsics.value
-            out[sensor.name, "intrinsics"] = np.zeros(N_INTRINSICS) if intrinsics is None else intrinsics
+            stated = stated_values(inputs, sensor)
+            for spec in sensor.specs()[len(MOUNTED_NAMES) :]:
+                value = getattr(sensor, spec.name).value
+                out[sensor.name, spec.name] = np.zeros(spec.size) if value is None else value
             is_fixed = all(getattr(sensor, name).mode == "fixed" for name in MOUNTED_NAMES)
             out |= stated if is_fixed else merged_values(sensor, stated, _aligned_values(inputs, sensor))
         return out

@@ -15,7 +15,7 @@ from icalib.optim.state import Key
 from icalib.rig import ImuNoise, ImuSensor, Rig
 from icalib.rig.scene import GRAVITY, WORLD
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
-from icalib.sensors.imu.residual import ImuFactor
+from icalib.sensors.imu.residual import ImuFactor, free_columns
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
@@ -39,9 +39,9 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
         if sensor.mounted:
             yield MountedImuFactor.build(further_imu_data(sensor, at.parts, at.measurements), at.motion, at.layout)
             return
-        intrinsics, key = at.layout.columns(sensor.name, "intrinsics"), (WORLD, GRAVITY.name)
-        gravity = at.layout.columns(*key) if at.layout.has(*key) else intrinsics[:0]
-        columns = np.concatenate([intrinsics[intrinsics >= 0], at.motion.imu.unit_columns(at.layout)])
+        free, key = free_columns(at.layout, sensor.name), (WORLD, GRAVITY.name)
+        gravity = at.layout.columns(*key) if at.layout.has(*key) else free[:0]
+        columns = np.concatenate([free, at.motion.imu.unit_columns(at.layout)])
         yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, columns, gravity)
 
     def joint_factors(

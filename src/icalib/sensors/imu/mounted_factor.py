@@ -17,7 +17,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
-from icalib.motion.imu_data import ImuData, clear_of
+from icalib.motion.imu_data import ImuData, at_one_place, clear_of
 from icalib.motion.poses import EstimatedMotion, gravity_of, offset_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, add_pose_chain
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece
@@ -33,7 +33,9 @@ from icalib.sensors.imu.residual import (
     fill_jacobians,
     fill_last_column,
     fill_residual,
-    preintegrated,
+    free_columns,
+    free_values,
+    preintegrated_by_all,
     state_change,
 )
 
@@ -45,8 +47,8 @@ WEAK_INFORMATION = 1e-6
 @njit(cache=True, nogil=True)
 def _linearise(first, last, chain, increments, dx, n_gravity, r, J):
     """Fills residuals r (m, 15), not whitened, of the intervals `first` to last - 1, and, unless it is empty, their
-    Jacobians J (m, 15, 30 + 24 or 0 + n_gravity) by poses (position in the world), velocities and biases at both ends,
-    intrinsics, and gravity. dx (24 or 0,): changes of the intrinsics since preintegration."""
+    Jacobians J (m, 15, 30 + p + n_gravity) by poses (position in the world), velocities and biases at both ends,
+    p free parameters, and gravity. dx (p,): changes of these parameters since preintegration."""
     change = np.zeros(9)
     for k in range(first, last):
         R01, hv, hp = state_change(k, chain)
@@ -76,7 +78,7 @@ class MountedImuFactor(RowFactor):
     layout: Layout
     seconds: np.ndarray
     increments: Increments
-    intrinsics0: np.ndarray
+    values0: np.ndarray
     starts: tuple[int, ...]
 
     @classmethod
@@ -88,8 +90,9 @@ class MountedImuFactor(RowFactor):
         intrinsics, bias = state.values[name, "intrinsics"], _own_states(layout, state, name)[:, 3:]
         usable = readings.covers(seconds[:-1], seconds[1:]) & clear_of(readings.seams, seconds[:-1], seconds[1:])
         usable[np.array(state.starts[1:], dtype=np.int64) - 1] = False
-        n_intrinsics = len(intrinsics) if layout.is_free(name, "intrinsics") else 0
-        increments = preintegrated(readings, seconds, usable, bias, intrinsics, n_intrinsics)
+        n_columns = len(free_columns(layout, name))
+        readings = at_one_place(readings, state, bias[:, :3].mean(axis=0))
+        increments = preintegrated_by_all(readings, seconds, usable, bias, intrinsics, n_columns)
         R = state.rotation @ state.values[name, "rotation"]
         # Zero residual without readings: Log of an arbitrary rotation may have no derivative.
         increments.dR[~usable] = (R[:-1].transpose(0, 2, 1) @ R[1:])[~usable]
@@ -97,7 +100,16 @@ class MountedImuFactor(RowFactor):
         bridged[np.array(state.starts[1:], dtype=np.int64) - 1] = False  # recordings are independent
         for column, density in zip(range(9, N_ROWS), np.repeat(readings.walk, 3), strict=True):
             increments.W[bridged, column, column] = 1.0 / np.sqrt(density * dt[bridged])
-        return cls(readings, motion.imu, motion.gravity, layout, seconds, increments, intrinsics.copy(), state.starts)
+        return cls(
+            readings,
+            motion.imu,
+            motion.gravity,
+            layout,
+            seconds,
+            increments,
+            free_values(state, name, n_columns),
+            state.starts,
+        )
 
     @property
     def name(self) -> str:
@@ -146,9 +158,9 @@ class MountedImuFactor(RowFactor):
         return cost
 
     def _columns(self, clock: int) -> np.ndarray:
-        """Calibration columns of the rows: pose, intrinsics of the body's IMU, own intrinsics, gravity."""
-        intrinsics = self.layout.columns(self.name, "intrinsics")[: self.increments.J.shape[2] - 6]
-        return np.concatenate([Kinematics.of(self).columns(clock), intrinsics, self._gravity_column])
+        """Calibration columns of the rows: pose, intrinsics of the body's IMU, free parameters of this one, gravity."""
+        free = free_columns(self.layout, self.name)
+        return np.concatenate([Kinematics.of(self).columns(clock), free, self._gravity_column])
 
     @property
     def _gravity_column(self) -> np.ndarray:
@@ -168,11 +180,11 @@ class MountedImuFactor(RowFactor):
 
     def _rows(self, state: State, chain: Chain, at: SensorPose, some: tuple[slice, int], jacobians: bool) -> Rows:
         """Rows of the intervals some[0]; some[1]: keyframe of the first pose in `at`."""
-        (k, first), n_own, gravity = some, self.increments.J.shape[2] - 6, self._gravity_column
+        (k, first), n_own, gravity = some, len(self.values0), self._gravity_column
         m = k.stop - k.start
         r = np.empty((m, N_ROWS))
         J_own = np.zeros((m if jacobians else 0, N_ROWS, 2 * KEYFRAME_DIM + n_own + len(gravity)))
-        dx = (state.values[self.name, "intrinsics"] - self.intrinsics0)[:n_own]
+        dx = free_values(state, self.name, n_own) - self.values0
         _linearise(k.start, k.stop, chain, self.increments, dx, len(gravity), r, J_own)
         dim, n_pose = self.layout.keyframe_dim, at.n_calib
         J = np.zeros((len(J_own), N_ROWS, 2 * dim + n_pose + n_own + len(gravity)))

@@ -7,7 +7,7 @@ accelerometer bias 3 [m/s^2]; see `ImuFactor`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,18 +16,20 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
-from icalib.motion.imu_data import ImuData
+from icalib.motion.imu_data import N_SIZE_EFFECT, ImuData, size_effect_matrix
 from icalib.motion.integration import Increment, bias_of, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
 from icalib.motion.poses import gravity_of
 from icalib.optim import memory
 from icalib.optim.arrowhead import Piece, accumulate_bias_prior, in_parallel
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
-from icalib.optim.state import KEYFRAME_DIM, State
+from icalib.optim.state import KEYFRAME_DIM, Layout, State
+from icalib.sensors.imu.spec import N_INTRINSICS
 
 N_ROWS = 15  # of an interval
 IS_LENGTH = np.array([False] * 3 + [True] * 6 + [False] * 3 + [True] * 3)  # (15,) rows in m, m/s and m/s^2
 NONE = np.zeros(0, dtype=np.int64)
+SIZE_EFFECT_STEP_M = 1e-2  # of difference quotients of increments, which are linear
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, N_ROWS)}
 
 
@@ -84,6 +86,47 @@ def preintegrated(
     halves = [(a, b) for begin, end in runs for a, b in ((begin, (begin + end) // 2), ((begin + end) // 2, end))]
     in_parallel(lambda k: _preintegrate(*k, seconds, first, readings, bias, intrinsics, *arrays), halves)
     return Increments(*arrays, bias)
+
+
+# Free groups of an IMU's parameters by their number of calibration columns, in the order of the columns.
+GROUPS: dict[int, tuple[str, ...]] = {
+    0: (),
+    N_SIZE_EFFECT: ("size_effect",),
+    N_INTRINSICS: ("intrinsics",),
+    N_INTRINSICS + N_SIZE_EFFECT: ("intrinsics", "size_effect"),
+}
+
+
+def free_columns(layout: Layout, imu: str) -> np.ndarray:
+    """Calibration columns of the free parameters of an IMU, see `GROUPS`."""
+    free = [g for g in ("intrinsics", "size_effect") if layout.has(imu, g) and layout.is_free(imu, g)]
+    return layout.columns(imu, *free) if free else NONE
+
+
+def free_values(state: State, imu: str, n_columns: int) -> np.ndarray:
+    """(n_columns,) values of the free parameters of an IMU, see `GROUPS`."""
+    return np.concatenate([np.zeros(0), *(state.values[imu, group] for group in GROUPS[n_columns])])
+
+
+def preintegrated_by_all(
+    imu: ImuData, seconds: np.ndarray, usable: np.ndarray, bias: np.ndarray, intrinsics: np.ndarray, n_columns: int
+) -> Increments:
+    """As `preintegrated`, with Jacobians by all free parameters, see `GROUPS`. The size effect changes the readings of
+    the accelerometer, in which increments of velocity and position are linear."""
+    groups = GROUPS[n_columns]
+    n_intrinsics = N_INTRINSICS if "intrinsics" in groups else 0
+    made = preintegrated(imu, seconds, usable, bias, intrinsics, n_intrinsics)
+    if "size_effect" not in groups:
+        return made
+    by_reading = size_effect_matrix(imu, bias[:, :3].mean(axis=0))
+    J = np.concatenate([made.J, np.zeros((len(made.J), 9, N_SIZE_EFFECT))], axis=2)
+    for k in range(N_SIZE_EFFECT):
+        step = replace(imu, accel=np.ascontiguousarray(imu.accel - SIZE_EFFECT_STEP_M * by_reading[:, :, k]))
+        moved = preintegrated(step, seconds, usable, bias, intrinsics, 0)
+        turned = so3.log_many(np.ascontiguousarray(made.dR.transpose(0, 2, 1) @ moved.dR))
+        change = np.concatenate([turned, moved.dv - made.dv, moved.dp - made.dp], axis=1)
+        J[:, :, J.shape[2] - N_SIZE_EFFECT + k] = change / SIZE_EFFECT_STEP_M
+    return made._replace(J=J)
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -218,10 +261,10 @@ class ImuFactor(RowFactor):
 
     imu: ImuData
     gravity: float  # [m/s^2], where the state has none
-    columns: np.ndarray  # (24 or 0,) calibration columns of free intrinsics, and that of the unit of length if any
+    columns: np.ndarray  # calibration columns of free parameters, see `GROUPS`, and that of the unit of length if any
     gravity_column: np.ndarray  # (1,) that of the magnitude of gravity, or (0,)
     increments: Increments
-    intrinsics0: np.ndarray  # (24,) at which the intervals were preintegrated
+    values0: np.ndarray  # of free parameters, at which the intervals were preintegrated, see `GROUPS`
     starts: tuple[int, ...] = (0,)
 
     @property
@@ -266,20 +309,20 @@ class ImuFactor(RowFactor):
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
         bias0, intrinsics = state.bias.copy(), state.values[imu.name, "intrinsics"].copy()
         seams = np.array(state.starts[1:], dtype=np.int64) - 1
-        n_intrinsics = len(columns) - (imu.unit is not None)
+        n_columns = len(columns) - (imu.unit is not None)
         usable = ~np.isin(np.arange(len(state.seconds) - 1), seams)
-        increments = preintegrated(imu, state.seconds, usable, bias0, intrinsics, n_intrinsics)
+        increments = preintegrated_by_all(imu, state.seconds, usable, bias0, intrinsics, n_columns)
         # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
         increments.dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
-        return cls(imu, gravity, columns, gravity_column, increments, intrinsics, state.starts)
+        values = free_values(state, imu.name, n_columns)
+        return cls(imu, gravity, columns, gravity_column, increments, values, state.starts)
 
     def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
         return ImuFactor.build(imu, state, self.gravity, self.columns, self.gravity_column)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
-        dx = state.values[self.imu.name, "intrinsics"] - self.intrinsics0
-        dx = dx if self.increments.J.shape[2] > 6 else np.zeros(0)
+        dx = free_values(state, self.imu.name, len(self.values0)) - self.values0
         gravity = gravity_of(state, self.gravity)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, gravity)
         unit, columns = self.imu.unit_length(state), np.concatenate([self.columns, self.gravity_column])

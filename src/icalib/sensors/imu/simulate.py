@@ -39,7 +39,8 @@ _HEADER = "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s
 @dataclass(frozen=True, eq=False)
 class SimImu(SimSensor):
     """An IMU at T_imu_sensor on the first one, with noise, biases at the first reading [rad/s, m/s^2] and intrinsics
-    (24,) of its own, see `Scenario`. Readings inside `gaps` are lost."""
+    (24,) of its own, see `Scenario`. size_effect (6,) [m]: places of the accelerometer's y and z axes relative to that
+    of x. Readings inside `gaps` are lost."""
 
     sensor_type: ClassVar[str] = "imu"
     random_stream: ClassVar[int] = 6000
@@ -49,20 +50,26 @@ class SimImu(SimSensor):
     gyro_bias: tuple[float, float, float] = (0.01, -0.02, 0.015)
     accel_bias: tuple[float, float, float] = (0.05, -0.08, 0.1)
     intrinsics: np.ndarray = field(default_factory=lambda: np.zeros(24))
+    size_effect: tuple[float, ...] = (0.0,) * 6
     gaps: tuple[Interval, ...] = ()
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimImu:
-        fields, common = mounted_fields(value, start_ns, options=("noise", "gyro_bias", "accel_bias", "gaps"))
+        fields, common = mounted_fields(
+            value, start_ns, options=("noise", "gyro_bias", "accel_bias", "size_effect", "gaps")
+        )
         chosen: dict[str, Any] = {n: tuple(fields[n].vector(3)) for n in ("gyro_bias", "accel_bias") if n in fields}
         if "noise" in fields:
             chosen["noise"] = imu_noise(fields["noise"])
+        if "size_effect" in fields:
+            chosen["size_effect"] = tuple(fields["size_effect"].vector(6))
         if "gaps" in fields:
             chosen["gaps"] = intervals(fields["gaps"])
         return cls(name, **common, **chosen)
 
     def true_parameters(self) -> TrueParameters:
-        return TrueParameters({"intrinsics": self.intrinsics})
+        values = {"intrinsics": self.intrinsics}
+        return TrueParameters(values | ({"size_effect": np.array(self.size_effect)} if any(self.size_effect) else {}))
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
         """Readings at instants within those of the first IMU; the truth is that without noise, biases included."""
@@ -71,6 +78,10 @@ class SimImu(SimSensor):
         stamps, seconds = stamps[kept], seconds[kept]
         errors = Errors(self.noise, scene.noisy, self.rate_hz, (*self.gyro_bias, *self.accel_bias), self.intrinsics)
         true = _true_readings(scene.trajectory, self.T_imu_sensor, seconds)
+        for axis, place in enumerate(np.reshape(self.size_effect, (2, 3)), start=1):
+            T = self.T_imu_sensor.copy()
+            T[:3, 3] += T[:3, :3] @ place
+            true[:, 3 + axis] = _true_readings(scene.trajectory, T, seconds)[:, 3 + axis]
         readings = readings_with_errors(errors, seconds, true, np.random.default_rng(seed))
         return Report(ImuStream(self.name, stamps, readings.gyro, readings.accel), readings)
 

@@ -75,6 +75,7 @@ INTRINSICS_LABELS = (
     *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
 )
 N_INTRINSICS = len(INTRINSICS_LABELS)
+SIZE_EFFECT = ParameterSpec("size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
 # consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.
@@ -146,6 +147,7 @@ class TwoSources:
 
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
+ONE_PLACE = Parameter("fixed")  # all axes of the accelerometer
 BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
@@ -163,7 +165,8 @@ class ImuSensor(MountedSensor):
     sampling: `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
     assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
     `motion.imu_model`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
-    prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU.
+    prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU. size_effect (6,): places
+    [m] of the accelerometer's y and z axes relative to that of x; fixed without a value: all at one place.
     """
 
     sensor_type: ClassVar[str] = "imu"
@@ -172,11 +175,13 @@ class ImuSensor(MountedSensor):
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
         ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1),
+        SIZE_EFFECT,
     )
 
     path: str | TwoSources
     noise: ImuNoise
     intrinsics: Parameter = BY_CLASS
+    size_effect: Parameter = ONE_PLACE
     topic: str | TwoSources | None = None  # in a bag; None: the one with the sensor's name, or the only one
     accel_unit: AccelUnit | None = None
     gyro_unit: GyroUnit | None = None
@@ -195,20 +200,29 @@ class ImuSensor(MountedSensor):
         elif self.intrinsics.mode == "free":
             start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
             object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
+        if self.size_effect.mode == "free":
+            start = np.zeros(SIZE_EFFECT.size) if self.size_effect.value is None else self.size_effect.value
+            sigma = np.full(SIZE_EFFECT.size, SIZE_EFFECT.prior_sigma)
+            object.__setattr__(self, "size_effect", Parameter("prior", start, sigma))
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Sensor`; extrinsics and time offset only where `mounted`."""
-        return self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
+        """See `Sensor`; extrinsics and time offset only where `mounted`, the size effect only where the rig file has
+        it."""
+        has_size = self.size_effect.mode != "fixed" or self.size_effect.value is not None
+        specs = self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
+        return specs if has_size else specs[:-1]
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> ImuSensor:
-        fields = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_FIELDS, *TABLE, *_MOUNT))
+        fields = value.record(
+            ("type",), ("path", "topic", "noise", "intrinsics", "size_effect", *_FIELDS, *TABLE, *_MOUNT)
+        )
         units: dict[str, Any] = {
             field: fields[field].choice("such unit as", get_args(kind))
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups = parameters(fields, MOUNTED)
+        groups = parameters(fields, (*MOUNTED, SIZE_EFFECT))
         if "intrinsics" in fields:
             groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(
