@@ -16,7 +16,7 @@ from icalib.observability.prior_sensitivity import (
     project_to_guess,
     project_to_prior,
 )
-from icalib.optim.arrowhead import Factors, NotDefiniteError, Piece
+from icalib.optim.arrowhead import Factors, NotDefiniteError
 from icalib.optim.state import Entry, State, make_layout
 
 TOLERANCE = {"translation": 5e-3, "time_offset": 1e-3}
@@ -56,7 +56,7 @@ def given(monkeypatch):
         held = problem.fixed_directions
         J = np.eye(8) - held @ held.T
         J[1] = np.eye(8)[1] - 2.0 * bend @ x
-        pieces, nothing = (Piece.zeros(0, 0, 8),), np.zeros((0, 0))
+        pieces, nothing = (), np.zeros((0, 0))
         information = J.T @ J / np.outer(problem.tolerance, problem.tolerance)
         return Factors(pieces, [], 2, nothing, np.zeros((0, 9)), information, problem.tolerance, held)
 

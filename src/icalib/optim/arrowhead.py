@@ -267,7 +267,8 @@ class Factors:
         white: further right-hand sides after forward substitution, per piece, then of the shared keyframe.
         """
         m = calib.shape[1]
-        chain = np.zeros((self.n_keyframes, self.pieces[0].dim, m))
+        dim = max((p.dim for p in self.pieces), default=KEYFRAME_DIM)
+        chain = np.zeros((self.n_keyframes, dim, m))
         if len(self.shared):
             chain[self.pieces[0].last] = np.linalg.solve(np.tril(self.shared).T, white[-1] - self.shared_side @ calib)
         keep = len(self.shared) > 0
