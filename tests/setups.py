@@ -28,7 +28,7 @@ from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_la
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
-from icalib.sensors.camera.model import restrict
+from icalib.sensors.camera.model import NO_BLOOM, restrict
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import OnPlanes, Surfaces
 from icalib.sensors.camera.tracks import TrackNoise
@@ -217,7 +217,7 @@ def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **change
         keyframe=keyframe,
         keep=np.ones(n, dtype=bool),
         noise=CornerNoise(np.full(n, 0.2), np.zeros(0), np.zeros((n, 2, 0))),
-        direction=np.zeros((0, 2)),
+        direction=NO_BLOOM,
         bodies=setup.bodies,
         layout=setup.layout,
         n_keyframes=len(state.seconds),

@@ -42,7 +42,7 @@ def test_residual_is_the_obvious_formula_at_the_true_motion(unlike, setup_of, fa
     setup = setup_of(unlike, split=split, shape=True)
     factor, rng = factor_of(setup, camera), np.random.default_rng(1)
     name, sim_camera = factor.name, setup.sim.scenario.cameras[camera]
-    factor = replace(factor, direction=rng.normal(size=factor.stream.uv.shape))
+    factor = replace(factor, direction=rng.normal(size=factor.stream.uv.shape).astype(np.float32))
     bodies, target = setup.bodies, setup.bodies.target
     shapes = {(body, "shape"): 2e-3 * rng.normal(size=11) for body in bodies.names}
     values = (
@@ -65,7 +65,7 @@ def test_residual_is_the_obvious_formula_at_the_true_motion(unlike, setup_of, fa
             point = values[body, "rotation"] @ point + values[body, "translation"]
         world = values["board0", "tilt"] @ point
         X = R_imu_cam.T @ (R[i].T @ (world - p[i]) - p_imu_cam)
-        predicted[n] = project(sim_camera, X) + 0.3 * factor.direction[n]
+        predicted[n] = project(sim_camera, X) + values[name, "bloom"] * factor.direction[n]
     np.testing.assert_allclose(out.residual, predicted - factor.stream.uv, rtol=0, atol=5e-8)
 
 

@@ -157,9 +157,10 @@ def test_placed_on_a_rig_that_turns_in_place(frame):
     accel = np.ascontiguousarray(R.transpose(0, 2, 1) @ [0.0, 0.0, GRAVITY])
     stream = ImuStream("imu0", np.round(1e9 * seconds).astype(np.int64), gyro, accel)
     imu = ImuData.build(stream, class_noise("consumer"))
-    keyframes, still = seconds[100:-100:20], np.zeros((len(seconds[100:-100:20]), 3))
+    keyframes = seconds[100:-100:20].copy()
+    still = np.zeros((len(keyframes), 3))
     values = {("imu0", "intrinsics"): np.zeros(24)}
-    state = State(keyframes, R[100:-100:20], still, still, np.zeros((len(keyframes), 6)), values)
+    state = State(keyframes, R[100:-100:20].copy(), still, still, np.zeros((len(keyframes), 6)), values)
     k = np.arange(200, 5800, 40)
     position = (R[k] @ ARM - ORIGIN) @ yaw(FRAME_YAW) + 0.005 * np.random.default_rng(1).normal(size=(len(k), 3))
     found = place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", Fix(seconds[k] - seconds[k[0]], position), known)
