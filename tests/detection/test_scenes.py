@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -137,9 +138,9 @@ def test_an_image_is_thresholded_once_for_all_targets(shots: list[Shot], monkeyp
 
 
 def test_sentences_on_a_scene(shots: list[Shot]):
-    images = [shot.pixels for shot in shots[:8]]
+    images = [shot.pixels for shot in shots[:4]]
     found, notes = found_in(images, Scene(("wall", "grid"), (TAGS, AprilGrid(3, 3, 0.1, 0.3))))
-    assert notes[0] == f"shown.bag /cam0: wall is in 8, grid is in 8 of 8 images, {len(found.uv)} corners."
+    assert notes[0] == f"shown.bag /cam0: wall is in 4, grid is in 4 of 4 images, {len(found.uv)} corners."
     assert len(notes) == 1 and (np.diff(found.start) > 20).all()
     board = Checkerboard(5, 6, 0.1)
     _, notes = found_in(images, Scene(("wall", "board"), (TAGS, board)))
@@ -149,13 +150,13 @@ def test_sentences_on_a_scene(shots: list[Shot]):
         found_in(images[:2], none)
 
 
-@pytest.mark.parametrize(("true", "stated"), [(2, 1), (1, 2)])
+@pytest.mark.parametrize(("true", "stated"), [(2, 1), pytest.param(1, 2, marks=pytest.mark.full)])
 def test_a_border_of_the_other_width_is_named(true: int, stated: int):
     scenario = handheld(2.2)
     grids = {bits: AprilGrid(6, 6, 0.088, 0.3, bits) for bits in (1, 2)}
     camera = replace(scenario.cameras[0], rate_hz=5.0)
     recording = film(replace(scenario, cameras=(camera,), target=grids[true]), 0)
-    images = [shot.pixels for shot in recording.shots()][:6]
+    images = [shot.pixels for shot in islice(recording.shots(), 3)]
     says = rf"\d+ tags of tag36h11 \(ids 0 to 35\) with border_bits {true}, not {stated}; correct border_bits"
     with pytest.raises(RecordingError, match=says) as caught:
         found_in(images, grids[stated])
