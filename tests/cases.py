@@ -13,20 +13,24 @@ import pytest
 FAILURES = (Exception, pytest.fail.Exception, pytest.skip.Exception)  # a case that is skipped was not tested
 
 
-def each(names: str | tuple[str, ...], cases: Iterable[Any]) -> Callable[[Callable[..., None]], Callable[..., None]]:
+def each(
+    names: str | tuple[str, ...], cases: Iterable[Any], full: Iterable[Any] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Like `pytest.mark.parametrize`, but one item: thousands of them take longer to collect than to run.
 
-    Each case has a folder `tmp_path` of its own, and ends with its patches; all other fixtures are shared.
+    Each case has a folder `tmp_path` of its own, and ends with its patches; all other fixtures are shared. `full`:
+    further cases, which are an item of their own, with the mark `full`.
     """
     keys = tuple(names.split(", ")) if isinstance(names, str) else names
-    listed = [_named(case, keys) for case in cases]
+    listed, further = ([_named(case, keys) for case in some] for some in (cases, full))
     assert listed, "no case"
 
     def decorate(test: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(test)
         def run(*instance: Any, **fixtures: Any) -> None:
             failed = []
-            for number, (label, values) in enumerate(listed):
+            run_now = further if further and fixtures.pop("in_full", False) else listed
+            for number, (label, values) in enumerate(run_now):
                 try:
                     with _own(fixtures, number) as own:
                         test(*instance, **values, **own)
@@ -34,12 +38,18 @@ def each(names: str | tuple[str, ...], cases: Iterable[Any]) -> Callable[[Callab
                     failed.append((label, error))
             if failed:
                 sentences = "\n".join(f"{label}: {type(error).__name__}: {error}" for label, error in failed)
-                raise AssertionError(f"{len(failed)} of {len(listed)} cases fail\n{sentences}") from failed[0][1]
+                raise AssertionError(f"{len(failed)} of {len(run_now)} cases fail\n{sentences}") from failed[0][1]
 
         signature = inspect.signature(test)
         kept = [p for name, p in signature.parameters.items() if name not in keys]
+        if further:
+            assert "in_full" not in signature.parameters, "one list of further cases is enough"
+            kept.append(inspect.Parameter("in_full", inspect.Parameter.KEYWORD_ONLY))
         run.__signature__ = signature.replace(parameters=kept)  # pyright: ignore[reportAttributeAccessIssue]: fixtures
-        return run
+        marked = pytest.mark.parametrize(
+            "in_full", [False, pytest.param(True, marks=pytest.mark.full)], ids=["ci", "full"]
+        )
+        return marked(run) if further else run
 
     return decorate
 

@@ -39,6 +39,13 @@ def test_it_nests_and_leaves_fixtures(a: int, b: float, tmp_path):
     assert tmp_path.is_dir() and a < b
 
 
+@each("a", [1, 2], full=[3])
+@each("b", [3.0, 4.0])
+def test_further_cases_are_an_item_of_their_own(a: int, b: float, request):
+    assert (a == 3) == (request.node.get_closest_marker("full") is not None)
+    assert request.node.callspec.params == {"in_full": a == 3}
+
+
 def test_no_case_or_one_of_other_length_is_an_error():
     for names, cases in (("a", []), ("a, b", [(1, 2, 3)])):
         with pytest.raises((AssertionError, ValueError)):

@@ -17,7 +17,7 @@ def tour_page(benchmark_program: Callable[[str], ModuleType]) -> ModuleType:
     return benchmark_program("tour_page")
 
 
-IN_CI = ("icalib inspect", "rig-equidistant.yaml", "--output out-mirrored", "icalib export")
+IN_CI = ("icalib inspect", "rig-equidistant.yaml", "icalib export")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="the page is for a Unix shell")

@@ -240,7 +240,7 @@ def corner_sample(
         stream=replace(stream, uv=stream.uv + rng.normal(size=(n, 2)) * rng.choice([0.8, 3.0], (n, 1), p=[0.8, 0.2])),
         keep=rng.random(n) < 0.15,
         noise=noise,
-        direction=rng.normal(size=(n, 2)),
+        direction=rng.normal(size=(n, 2)).astype(np.float32),
         seams=(int(np.searchsorted(factor.keyframe, setup.state.starts[1])),) if restarts else (),
     )
     state = setup.perturbed(rng, 0.02)
@@ -954,7 +954,7 @@ def test_gradient_is_the_slope_of_the_cost(name, sample_of, dense):
     cost, _, g = sums_of(sample, dense)
     assert cost > 0
     rng, scale, h = np.random.default_rng(9), scales(sample), 2e-5
-    for _ in range(10):
+    for _ in range(4):  # each moves all columns
         d = rng.normal(size=len(g)) * scale
         slope = (cost_at(sample, h * d) - cost_at(sample, -h * d)) / (2 * h)
         assert slope == pytest.approx(g @ d, rel=sample.tolerance, abs=sample.tolerance * np.linalg.norm(g * scale))

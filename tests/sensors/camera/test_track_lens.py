@@ -80,7 +80,7 @@ def off_px(simulation: Simulation, lens: np.ndarray) -> float:
     return float(np.sqrt(((model.project(true, turned)[0] - uv) ** 2).sum(axis=1).mean()))
 
 
-@each("lens", LENSES)
+@each("lens", ["radtan", "fisheye", "eucm"], full=["long", "double sphere", "omni", "rational"])
 def test_every_model_is_found(lens: str):
     """To 3 mrad: half a pixel of a fisheye lens, two of a long one."""
     simulation = drive(lens)
@@ -90,7 +90,8 @@ def test_every_model_is_found(lens: str):
 
 @each(
     ("example", "noise_px", "most_px"),
-    [("table2-3d", 0.0, 0.7), ("table2-planar", 1.0, 3.0), ("table2-ramp", 1.0, 3.0), ("single-axis", 0.3, 3.0)],
+    [("table2-planar", 1.0, 3.0), ("single-axis", 0.3, 3.0)],
+    full=[("table2-3d", 0.0, 0.7), ("table2-ramp", 1.0, 3.0)],
 )
 def test_other_motions(example: str, noise_px: float, most_px: float):
     """3 px at half the image's width are 1 % of the focal length."""
