@@ -19,6 +19,7 @@ from icalib.rig import Parameter
 from icalib.rig.file import lack_of, rig_from_dict, rig_to_dict
 from icalib.sensors.imu.simulate import SimImu
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate
+from icalib.tools.simulation.scenario import HandheldMotion
 
 SEED = 3
 
@@ -125,6 +126,16 @@ def test_imus_alone_are_calibrated_to_each_other(recorded, result):
         for key, error in errors(alone, recorded, name).items():
             assert (np.abs(error) < 3.3 * alone.group(name, key).std).all(), (name, key)
             assert (alone.group(name, key).std < 1.5 * result.group(name, key).std).all()
+
+
+def test_turns_about_one_axis_do_not_show_the_lever_arm_along_it():
+    """Gravity shows the rotation about the axis."""
+    made = replace(handheld(10.0), cameras=(), motion=HandheldMotion("single_axis"))  # about y of the body
+    simulation = simulate(made.with_sensors(scenario().of(SimImu)[0]), seed=1)
+    found = calibrate_measurements(rig_for(simulation.scenario), simulation.measurements)
+    assert found.group("imu1", "translation").verdict == ("determined", "unobservable", "determined")
+    assert found.group("imu1", "rotation").verdict == ("determined",) * 3
+    assert any("imu1 translation y: not determined by this motion" in reason for reason in found.reasons)
 
 
 def test_a_second_imu_that_starts_late_and_drops_out(recorded, result):

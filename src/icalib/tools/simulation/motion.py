@@ -123,7 +123,8 @@ def reference_motion(scenario: Scenario, rng: np.random.Generator) -> Reference:
     board's centre, or at the origin of T_world_board if the target has several bodies."""
     motion = scenario.motion
     assert isinstance(motion, HandheldMotion)
-    T_imu_cam = scenario.cameras[0].T_imu_sensor
+    # A rig without cameras faces the board along its z axis.
+    T_imu_cam = scenario.cameras[0].T_imu_sensor if scenario.cameras else np.eye(4)
     R_world_board, origin = scenario.T_world_board[:3, :3], scenario.T_world_board[:3, 3]
     corners = scenario.target.points if scenario.T_world_bodies is None else np.zeros((1, 3))
     middle = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) + [0.0, 0.0, motion.distance_m]
