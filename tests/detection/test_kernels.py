@@ -194,7 +194,7 @@ def test_a_crossing_moves_to_its_place_where_the_curvature_is_known(curvature, t
     blur = np.hypot(0.9, np.sqrt(1.0 / 12.0))
     sides, known = ((eb, ea), curvature[::-1]) if turned else ((ea, eb), curvature)
     surroundings = np.array([0.5, np.inf, np.inf])
-    rng, before, after, edges = np.random.default_rng(6), [], [], np.zeros(0)
+    rng, before, after, edges = np.random.default_rng(6), [], [], np.zeros((2, 7))
     for _ in range(20):  # rounding alone moves a corner by 0.003 px; with noise before it, its mean is 0
         noisy = greys(image + rng.uniform(-0.5, 0.5, image.shape))
         u, v, _, _, edges = fit_crossing(noisy, 30.0, 30.0, *sides, surroundings, blur, blur, 2.0)
