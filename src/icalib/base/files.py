@@ -603,6 +603,7 @@ def _within(content: bytes, most: int) -> bytes:
 
 
 VIDEO_FILE = "video file"  # `TopicInfo.type` of a video
+CLOUD_SUFFIXES = (".pcd", ".ply", ".bin")  # of files with one point cloud each
 HEAD_BYTES = 64  # length of `head` for `not_data`
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".h264", ".h265", ".mjpeg", ".insv", ".360")
 _POINTERS = {b"version https://git-lfs.github.com/spec": "git lfs pull", b"/annex/objects/": "git annex get"}

@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from functools import cached_property
 from pathlib import Path
 from typing import final
 
 import numpy as np
 
-from icalib.base.files import VIDEO_FILE
+from icalib.base.files import CLOUD_SUFFIXES, VIDEO_FILE
 from icalib.base.remark import Remark
 from icalib.data.images import (
     SUFFIXES,
@@ -241,6 +241,7 @@ def _top_tables(folder: Path) -> dict[Path, TableFile]:
 # The file name gives the time of an image: a stamp since 1970 in s, ms, us or ns, or else the last number in the name.
 # Images with the same stamp or number were taken at the same time.
 
+CLOUD_FILES = "point clouds"  # `TopicInfo.type` of files of point clouds
 APART_NS = 1_000_000_000  # artificial stamps: interval from one number to the next
 MOST = 9_000_000_000  # largest number: its artificial stamp fits in int64
 MIXED = 0.75  # distinct numbers / images; below it, a folder mixes images of several cameras
@@ -254,11 +255,11 @@ def has_pictures(root: Path) -> bool:
 
 @final
 class PictureFolder(Recording):
-    """A folder of images, or with one subfolder of images for each camera.
+    """A folder of images, or with one subfolder of images for each camera; and of point clouds of LiDARs at rest.
 
-    A topic is the name of a subfolder, `.` for the root, or a file pattern such as `images/*_0.jpg`. The star stands
-    for the number of the image. If several images of a folder share a number, such as left1.png and right1.png,
-    each pattern is a topic.
+    A topic of images is the name of a subfolder, `.` for the root, or a file pattern such as `images/*_0.jpg`. The star
+    stands for the number of the image. If several images of a folder share a number, such as left1.png and right1.png,
+    each pattern is a topic. Topics of clouds are patterns. Files with the same number belong to the same stop.
     """
 
     def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
@@ -267,10 +268,11 @@ class PictureFolder(Recording):
             self.note(window.note(str(root)))
 
     def topics(self) -> tuple[TopicInfo, ...]:
-        return tuple(self._info(name) for name in _topics(self.root))
+        clouds = (replace(self._info(n), type=CLOUD_FILES, kind="points") for n in _topics(self.root, CLOUD_SUFFIXES))
+        return (*(self._info(name) for name in _topics(self.root)), *clouds)
 
     def stamps(self, topic: str) -> np.ndarray:
-        return np.array([stamp for stamp, _ in self._files_inside(topic)], np.int64)
+        return np.array([stamp for stamp, _ in self.stills(topic)], np.int64)
 
     def image_topic(self, sensor: str, given: str | None) -> str:
         if given is not None and "*" in given:
@@ -284,9 +286,7 @@ class PictureFolder(Recording):
         return choose_topic(str(self.root), topics, sensor, given, "image").name
 
     def payloads(self, topic: str) -> Iterator[Payload]:
-        files, where = self._files_inside(topic), f"{self.root}/{topic}"
-        for _, path in files:
-            self._remember(path)
+        files, where = self.stills(topic), f"{self.root}/{topic}"
         return checked_payloads(file_payloads(files, where, self.note), where, self.note)
 
     def find(self, path: str) -> None:
@@ -311,20 +311,22 @@ class PictureFolder(Recording):
             return TopicInfo(name, "pictures", "image", len(pictures_in(self.root / name)), None, None)
         return TopicInfo(name, "pictures", "image", len(stamps), stamps[0], stamps[-1])
 
-    def _files_inside(self, topic: str) -> list[tuple[int, Path]]:
-        """As `_files`, for images in the time window."""
+    def stills(self, topic: str) -> list[tuple[int, Path]]:
+        """Stamp [ns] and file of each image or cloud in the time window, sorted. Adds the files to `files()`."""
         files = self._files(topic)
-        if self.window.is_all:
-            return files
-        stamps_ns = np.array([stamp for stamp, _ in files], np.int64)
-        inside = self._inside(stamps_ns, f"{self.root}/{topic}")
-        return [file for file, used in zip(files, inside.tolist(), strict=True) if used]
+        if not self.window.is_all:
+            stamps_ns = np.array([stamp for stamp, _ in files], np.int64)
+            inside = self._inside(stamps_ns, f"{self.root}/{topic}")
+            files = [file for file, used in zip(files, inside.tolist(), strict=True) if used]
+        for _, path in files:
+            self._remember(path)
+        return files
 
     def _files(self, topic: str) -> list[tuple[int, Path]]:
         """Stamp [ns] and file of each image, sorted. Raises RecordingError if a number is missing or repeated."""
         if "*" in topic:
             before, _, after = topic.partition("*")
-            paths = [p for p in self.root.glob(topic) if p.suffix.lower() in SUFFIXES]
+            paths = [p for p in self.root.glob(topic) if p.suffix.lower() in (*SUFFIXES, *CLOUD_SUFFIXES)]
             keys = [str(p.relative_to(self.root))[len(before) : -len(after) or None] for p in paths]
         else:
             paths = pictures_in(self.root / topic)
@@ -359,24 +361,37 @@ class PictureFolder(Recording):
         return images
 
 
-def _topics(root: Path) -> list[str]:
-    folders = sorted(p.name for p in root.iterdir() if p.is_dir() and pictures_in(p)) if root.is_dir() else []
-    return [name for folder in (".", *folders) for name in _patterns_of_cameras(root, folder)]
+def _topics(root: Path, suffixes: Sequence[str] = SUFFIXES) -> list[str]:
+    folders = sorted(p.name for p in root.iterdir() if pictures_in(p, suffixes)) if root.is_dir() else []
+    patterns = _image_patterns if suffixes is SUFFIXES else _cloud_patterns
+    return [name for folder in (".", *folders) for name in patterns(root, folder)]
 
 
-def _patterns_of_cameras(root: Path, folder: str) -> list[str]:
+def _image_patterns(root: Path, folder: str) -> list[str]:
     """Topics of `folder`: file patterns, if it mixes the images of several cameras with shared numbers; else `folder`;
     empty without images."""
     pictures = pictures_in(root / folder)
-    paths = [path for path in pictures if re.search(r"\d", path.stem)]
+    return _patterns_of_sensors(folder, pictures) or ([folder] if pictures else [])
+
+
+def _cloud_patterns(root: Path, folder: str) -> list[str]:
+    """Topics of `folder`, as `_image_patterns`; a single LiDAR has a pattern, too, as images may be beside it."""
+    clouds = pictures_in(root / folder, CLOUD_SUFFIXES)
+    of_one = [pattern if folder == "." else f"{folder}/{pattern}" for pattern in {f"*{p.suffix}": 0 for p in clouds}]
+    return _patterns_of_sensors(folder, clouds) or of_one
+
+
+def _patterns_of_sensors(folder: str, files: list[Path]) -> list[str]:
+    """File patterns, if `files` of `folder` are those of several sensors with shared numbers; else empty."""
+    paths = [path for path in files if re.search(r"\d", path.stem)]
     # The number is the last or the second last in the names, whichever gives fewer patterns.
     patterns = min((_patterns(paths, place) for place in (-1, -2)), key=len)
     numbers = [number for group in patterns.values() for number in group]
-    # With two cameras nearly all numbers occur twice. Different names of one camera hardly share numbers.
+    # With two sensors nearly all numbers occur twice. Different names of one sensor hardly share numbers.
     alike = len(patterns) > 1 and min(map(len, patterns.values())) > 1
     if alike and sum(map(len, patterns.values())) == len(paths) and len(set(numbers)) < MIXED * len(numbers):
         return sorted(pattern if folder == "." else f"{folder}/{pattern}" for pattern in patterns)
-    return [folder] if pictures else []
+    return []
 
 
 def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:

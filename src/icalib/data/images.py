@@ -430,8 +430,8 @@ def image_files(folder: Path, note: Note = ignore) -> list[tuple[int, Path]]:
     return sorted((int(p.stem), p) for p in numbered)
 
 
-def pictures_in(folder: Path) -> list[Path]:
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES) if folder.is_dir() else []
+def pictures_in(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes) if folder.is_dir() else []
 
 
 def stamped_by_name(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from icalib.base.remark import Remark
+from icalib.data.folder import PictureFolder
 from icalib.data.images import Note, ignore
 from icalib.data.messages import HasMessages, MessageType, UnreadType
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
@@ -72,7 +73,7 @@ def read(recording: Recording, sensors: Sequence[Camera], reading: Reading) -> l
 
     Raises RecordingError if data are missing or cannot be read, or if two cameras share an image topic."""
     streams: list[ReadImages] = _tracks(recording, sensors, reading) + _corners(recording, sensors, reading)
-    if reading.rig.cameras_alone:
+    if reading.rig.cameras_alone or isinstance(recording, PictureFolder):
         return [*streams]
     names = {stream.name for stream, _ in streams}
     sources = {c.name: f"{source(recording, c)} ({c.name})" for c in sensors if c.name in names}

@@ -11,14 +11,17 @@ import numpy as np
 
 from icalib.base.files import HEAD_BYTES, load_arrays, not_data
 from icalib.base.remark import Remark
+from icalib.data.folder import PictureFolder
 from icalib.data.messages import MessageType, TopicInfo, UnreadType
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.tables import TableFile
 from icalib.errors import RecordingError
+from icalib.sensors.lidar.read.cloud_files import read_cloud
 from icalib.sensors.lidar.read.point_clouds import (
     LIVOX_TYPES,
     Sieve,
     checked_lidar,
+    checked_stops,
     parse_cdr,
     parse_ros1,
     point_clouds,
@@ -71,6 +74,9 @@ def read(recording: Recording, sensors: Sequence[Lidar], reading: Reading) -> li
     streams = []
     for sensor in sensors:
         where = recording.where(sensor)
+        if isinstance(recording, PictureFolder):
+            streams.append(checked_stops(scans(recording, sensor), f"{where} ({sensor.name})"))
+            continue
         # Checked before the cut, which would take a single wrong stamp for a jump of the clock.
         stream, notes = checked_lidar(scans(recording, sensor), where)
         streams.append((reading.cut(stream, f"{where} ({sensor.name})"), notes))
@@ -83,9 +89,12 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
     Raises RecordingError naming file or topic if the data are missing or cannot be read, or point times are unknown.
     """
     path, what = source(recording, sensor), f"{recording.where(sensor)} ({sensor.name})"
-    if isinstance(path, TopicInfo):
+    if isinstance(path, TopicInfo) and isinstance(recording, PictureFolder):
+        stream, notes = read_stops(sensor, recording.stills(path.name), what)
+    elif isinstance(path, TopicInfo):
         stream, notes = read_clouds(point_clouds(recording, path.name), sensor, what)
     else:
+        assert isinstance(path, Path)
         sieve = Sieve(sensor.min_range_m, sensor.max_range_m)
         stream, notes = in_seconds(recording.inside(read_scans(sensor.name, path), path), sensor, what)
         stream = sifted(stream, sieve)
@@ -97,9 +106,26 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
 
 def source(recording: Recording, sensor: Lidar) -> Path | TopicInfo:
     """File or topic of the scans."""
-    if recording.has_messages:
+    if recording.has_messages or isinstance(recording, PictureFolder):
         return recording.topic(sensor.name, sensor.topic, "points")
     return recording.table(sensor, sensor.path)
+
+
+# Clouds of a LiDAR that stands still, one file for each stop.
+
+
+def read_stops(sensor: Lidar, files: Sequence[tuple[int, Path]], what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
+    """The clouds in `files` (stamp [ns], path) as scans, all points of which are taken at the stamp, and a note on
+    unusable points. what: name of the files in messages."""
+    sieve = Sieve(sensor.min_range_m, sensor.max_range_m)
+    clouds = [read_cloud(path) for _, path in files]
+    clouds = [cloud[sieve.keep(cloud, np.zeros(len(cloud), np.float32))] for cloud in clouds]
+    start = np.cumsum([0, *(len(cloud) for cloud in clouds)])
+    xyz = np.concatenate([np.empty((0, 3), np.float32), *clouds])
+    stamps_ns, offset_s = np.array([stamp for stamp, _ in files], np.int64), np.zeros(len(xyz), np.float32)
+    stream = LidarStream(sensor.name, stamps_ns, start, offset_s, xyz, np.full(len(xyz), -1, np.int32))
+    note = sieve.note(what)
+    return stream, () if note is None else (note,)
 
 
 # Reads scans of a LiDAR from arrays in a file (npz), as `icalib simulate` writes them. Format: docs/recordings.md.

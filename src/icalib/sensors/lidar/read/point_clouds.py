@@ -344,19 +344,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[R
     an implausible rate, or points far from the stamp of their scan.
     """
     what = f"{where} ({stream.name})"
-    filled = np.diff(stream.start) > 0
-    if filled.sum() < 2:
-        raise RecordingError(
-            f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the "
-            "whole recording. Check the driver, and min_range and max_range in the rig file."
-        )
-    notes = ()
-    if not filled.all():
-        sentence = f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out."
-        note = Remark("scans_empty", sentence)
-        notes = (note,)
-        start = np.append(stream.start[:-1][filled], stream.start[-1])
-        stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
+    stream, notes = checked_stops(stream, what)
     for check in (without_repeats, in_order, with_even_stamps, at_even_steps):
         stream, more = check(stream, what)
         notes += more
@@ -369,6 +357,23 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[R
         raise RecordingError(sentence)
     stream, more = _near_their_stamps(stream, what)
     return stream, notes + more
+
+
+def checked_stops(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
+    """`stream` without empty scans, and a note on these. Raises RecordingError naming `what` if fewer than two scans
+    have points."""
+    filled = np.diff(stream.start) > 0
+    if filled.sum() < 2:
+        raise RecordingError(
+            f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the "
+            "whole recording. Check the driver, and min_range and max_range in the rig file."
+        )
+    if filled.all():
+        return stream, ()
+    sentence = f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out."
+    start = np.append(stream.start[:-1][filled], stream.start[-1])
+    stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
+    return stream, (Remark("scans_empty", sentence),)
 
 
 def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
