@@ -11,7 +11,7 @@ Levenberg-Marquardt with Huber's loss; the pose of each image is eliminated by t
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple
@@ -85,6 +85,26 @@ def camera_params(camera: Camera, stream: CornerStream, target: Target) -> np.nd
     if not candidates:
         return guess_intrinsics(images, points, model, camera.resolution, fixed)
     return min(candidates, key=lambda params: _median_rms(trial, model, params, points))
+
+
+CLEARER_FIT = 0.8  # ratio of errors: below it another model fits clearly better; noise alone gives 0.95 and more
+
+
+def fitting_model(
+    stream: CornerStream, target: Target, resolution: tuple[int, int], names: Sequence[str]
+) -> tuple[str, dict[str, float]]:
+    """The camera model among `names` that fits the corners clearly better than the first, else the first; and the error
+    [px] of each, of the median image. Infinite if a model fits no lens."""
+    images, points = _one_body_per_image(stream, target)
+    errors: dict[str, float] = {}
+    for name in names:
+        model, errors[name] = camera_model(name), np.inf
+        with suppress(EstimationError):
+            unknown = np.full(len(model.parameter_names), np.nan)
+            params = guess_intrinsics(images, points, model, resolution, unknown)
+            errors[name] = _median_rms(images, model, params, points)
+    best = min(errors, key=lambda name: errors[name])
+    return (best if errors[best] < CLEARER_FIT * errors[names[0]] else names[0]), errors
 
 
 def _stated(camera: Camera, with_guesses: bool) -> np.ndarray:

@@ -7,8 +7,8 @@ Detections of the target in images: their number, coverage of the image, tilts a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from icalib.detection.detectors import checkerboard_in, tags_in
 from icalib.errors import RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.targets import Target
+from icalib.sensors.camera.initialize.intrinsics import fitting_model
 from icalib.sensors.camera.read import CameraInfo
 from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
@@ -57,7 +58,9 @@ class TargetView:
     images: their number, None if only corners were recorded; seen: number of images with the target; corners: number in
     all images. cells: number of corners in each cell of a grid over the image, row by row; None if the resolution is
     unknown. tilt_deg: 10th, 50th and 90th percentile of the angle between the optical axis and the target's normal;
-    distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown.
+    distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown. model:
+    camera model that fits the corners, None if they are too few; errors_px: of the models compared, see
+    `fitting_model`.
     """
 
     camera: str
@@ -69,6 +72,8 @@ class TargetView:
     distance_ratio: float | None
     notes: tuple[str, ...] = ()
     problem: str = ""
+    model: str | None = None
+    errors_px: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -210,6 +215,9 @@ def target_view(
         return TargetView(name, None, 0, 0, None, None, None, problem=str(error))
     count = np.diff(corners.start)
     tilt, ratio = _poses(corners, target)
+    model, errors_px = None, {}
+    if resolution is not None and (count > 0).sum() >= FEWEST_FOR_MODEL:
+        model, errors_px = fitting_model(corners, target, resolution, (DEFAULT_MODEL, FISHEYE_MODEL))
     return TargetView(
         name,
         images=None if tabled else len(count),
@@ -219,6 +227,8 @@ def target_view(
         tilt_deg=tilt,
         distance_ratio=ratio,
         notes=notes,
+        model=model,
+        errors_px=errors_px,
     )
 
 
@@ -303,7 +313,8 @@ def _starts(lens: LensStart) -> Iterable[str]:
         yield f"    distortion: {{guess: {numbers(lens.distortion)}}}  # {names} from {comment(lens.source)}"
 
 
-DEFAULT_MODEL = "pinhole-radtan"
+DEFAULT_MODEL, FISHEYE_MODEL = "pinhole-radtan", "pinhole-equidistant"
+FEWEST_FOR_MODEL = 5  # images whose corners show which camera model fits
 _BROWN = ("plumb_bob", "rational_polynomial")
 _FISHEYES = ("equidistant", "fisheye", "kannala_brandt4")
 Values = tuple[float, ...]
@@ -337,6 +348,9 @@ def lens_start(
     info = inspection.facts[name].info
     if info is None or camera.info is None:
         why = "for lenses of up to about 100 deg; for a fisheye: pinhole-equidistant"
+        if (view := inspection.facts[name].view) is not None and view.model is not None:
+            errors = ", ".join(f"{model} {error:.2g}" for model, error in view.errors_px.items())
+            return LensStart(view.model, f"fits the corners best, RMS [px]: {errors}", notes=tuple(notes))
         return LensStart(DEFAULT_MODEL, why, notes=tuple(notes))
     return _from_info(info, camera, camera.info.name, resolution, notes)
 
@@ -365,7 +379,7 @@ def _from_info(
 def _model(info: CameraInfo) -> str:
     """The simplest model for all coefficients, which OpenCV orders k1, k2, p1, p2, k3, k4, k5, k6, ..."""
     if info.model in _FISHEYES:
-        return "pinhole-equidistant"
+        return FISHEYE_MODEL
     if info.model not in _BROWN or len(info.distortion) < 5:
         return DEFAULT_MODEL
     return "pinhole-rational" if np.any(info.distortion[5:8]) else "pinhole-radtan5"
