@@ -13,6 +13,7 @@ import pkgutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,19 +28,21 @@ import icalib.sensors
 from icalib.data.measurements import ImuStream, PoseStream
 from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
-from icalib.model.bodies import SIZE
+from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
+from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import output_at
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import EstimatedMotion, offset_at, poses_at
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
 from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import State, in_recording, make_layout
-from icalib.rig import Ground, Loss, Scheme
+from icalib.rig import Ground, Lidar, Loss, Scheme
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
 from icalib.sensors.imu.residual import ImuFactor, free_columns
 from icalib.sensors.lidar.binning import LidarNoise
+from icalib.sensors.lidar.board_factor import ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
 from icalib.sensors.position.stream import PositionStream
@@ -653,6 +656,32 @@ def position_sample(
     return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
+def board_sample(kind, loss: Loss = "none", curved=False):
+    """Points at rest, anywhere near planes of two bodies, one of which stands in the scene."""
+    rng, n = np.random.default_rng(9), 60
+    target = Scene(("wall", "floor"), (Checkerboard(4, 5, 0.1, sheet=(0.8, 0.9)), AprilGrid(2, 2, 0.1, 0.3)))
+    bodies = Bodies(target, (0, 1))
+    entries = [spec.entry("lidar0", spec.name != "time_offset") for spec in Lidar.parameters]
+    layout = make_layout([*entries, *bodies.pose_entries()])
+    values = {
+        (b.sensor, b.name): so3.exp(rng.normal(size=3)) if b.kind == "rotation" else 0.1 * rng.normal(size=b.size)
+        for b in layout.blocks
+    }
+    rotation = np.array([so3.exp(v) for v in rng.normal(size=(4, 3))])
+    still = np.zeros((4, 3)), np.zeros((4, 6)), values
+    state = State(np.arange(4.0), rotation, rng.normal(size=(4, 3)), *still)
+    keyframe, normal = np.repeat(np.sort(rng.integers(0, 4, n // 2)), 2), rng.normal(size=(n, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    points = BoardPoints(
+        keyframe.astype(float), 3.0 * rng.normal(size=(n, 3)), keyframe, rng.integers(0, 2, n), normal,
+        rng.normal(size=n),
+    )  # fmt: skip
+    noise, sigma = LidarNoise(1.0, 0.0, loss, LOSS_SCALE), rng.uniform(0.5, 2.0, n if kind == ON_BOARDS else n // 2)
+    made = BoardFactor("lidar0", kind, points, sigma, noise, bodies, (0,), 4, layout)
+    setup = SimpleNamespace(layout=layout, columns_scale=lambda: np.full(layout.size, 1e-2))
+    return row_sample(setup, state, made, loss if curved else "none", curved)
+
+
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
@@ -727,6 +756,8 @@ SAMPLES = {
         lambda u, s, f: lidar_sample(*s, scheme="pose", loss="cauchy", imu_free=True),
     ),
     "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
+    "points on boards": ("BoardFactor", lambda u, s, f: board_sample(ON_BOARDS)),
+    "edges of boards, huber, curved": ("BoardFactor", lambda u, s, f: board_sample(ON_EDGES, "huber", True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),
     "prior on IMU intrinsics": ("Prior", lambda u, s, f: prior_sample(u, s, "imu0", "intrinsics")),

@@ -353,9 +353,9 @@ def spread_variance(outcome: Outcome, parts: Segments, white: np.ndarray) -> np.
 
 
 def calibration_columns(inputs: Inputs) -> np.ndarray:
-    """Calibration columns that matter to a user: of sensors, without nuisance parameters and bloom."""
+    """Calibration columns that matter to a user: of sensors, without nuisance and auxiliary parameters."""
     blocks = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and not b.is_nuisance)
-    return np.concatenate([np.arange(0), *(b.columns for b in blocks if b.name != "bloom")])
+    return np.concatenate([np.arange(0), *(b.columns for b in blocks if not inputs.specs[b.key].is_auxiliary)])
 
 
 def inflation(inputs: Inputs, outcome: Outcome) -> float:

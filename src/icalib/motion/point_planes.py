@@ -63,10 +63,11 @@ def thinned(plane: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class PlaneAssociation:
     """Index of the plane of each LiDAR point. names (P,): of the planes, different from all sensor names. plane: for
-    each LiDAR (N,) int32, plane of each point, -1 for none."""
+    each LiDAR (N,) int32, plane of each point, -1 for none. on_target: points lie on the target instead."""
 
     names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
+    on_target: bool = False
 
     @property
     def count(self) -> int:
@@ -96,6 +97,7 @@ class PlaneAssociation:
 
 
 NO_ASSOCIATION = PlaneAssociation((), ())
+WITH_TARGET = PlaneAssociation((), (), on_target=True)
 
 
 def joined_associations(each: Sequence[PlaneAssociation]) -> PlaneAssociation:

@@ -554,8 +554,8 @@ def _columns(c: Calibration) -> np.ndarray:
 
 
 def _estimated_groups(c: Calibration) -> list[ParameterGroup]:
-    """Estimated groups of sensors except edge bloom."""
-    return [g for g in c.groups if g.columns is not None and g.sensor in c.rig["sensors"] and g.name != "bloom"]
+    """Estimated groups of sensors except auxiliary ones."""
+    return [g for g in c.groups if g.columns is not None and g.sensor in c.rig["sensors"] and g.name not in AUXILIARY]
 
 
 def _printed(c: Calibration) -> str:

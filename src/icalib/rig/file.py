@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
+import numpy as np
 import yaml
 
 from icalib.base.files import NAME, NAME_WORDS
@@ -156,9 +157,26 @@ def target_of(value: YamlValue) -> Target:
         value.fail(f"type is missing; add type: {', type: '.join(_FIELDS)}.")
     kind = entries["type"].choice("target type", tuple(_FIELDS))
     required, optional = _FIELDS[kind]
-    fields = value.record(("type", *required), (*optional, "size_sigma"))
+    fields = value.record(("type", *required), (*optional, "size_sigma", "sheet"))
     target = _of_kind(kind, value, fields)
+    if "sheet" in fields:
+        target = replace(target, sheet=_sheet(fields["sheet"], target))
     return replace(target, size_sigma=_size_sigma(fields["size_sigma"])) if "size_sigma" in fields else target
+
+
+def _sheet(value: YamlValue, target: Target) -> tuple[float, float]:
+    """Width and height [m] of the sheet that `target` is printed on, along its x and y."""
+    sides = value.items()
+    if len(sides) != 2 or len(target.bodies) != 1:
+        value.fail("is [width, height] in metres, of a target of a single body; write two numbers, or remove it.")
+    width, height = (side.positive() for side in sides)
+    needed = np.ptp(target.points[:, :2], axis=0)
+    if width < needed[0] or height < needed[1]:
+        value.fail(
+            f"is smaller than the {needed[0]:.3g} x {needed[1]:.3g} m that its points span along x and y; write "
+            "[width, height] in metres, in the order of the target's axes."
+        )
+    return width, height
 
 
 def _size_sigma(value: YamlValue) -> float:

@@ -46,7 +46,7 @@ from icalib.result import (
     by_key,
 )
 from icalib.result.calibration import Timeline, row_record, versions
-from icalib.result.verdict import failure_words
+from icalib.result.verdict import AUXILIARY, failure_words
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.validation.causes import all_causes, scatter_warnings
@@ -305,8 +305,8 @@ def _warnings(assessed: AssessedEstimate) -> Iterator[Remark]:
 
 
 def _factors(inputs: Inputs, groups: tuple[ParameterGroup, ...]) -> np.ndarray:
-    """(n,) empirical factors of all estimated parameters of sensors, without edge bloom."""
-    sensor_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name != "bloom")
+    """(n,) empirical factors of all estimated parameters of sensors, without auxiliary ones."""
+    sensor_groups = (g for g in groups if g.mode != "fixed" and inputs.is_sensor(g.sensor) and g.name not in AUXILIARY)
     return np.concatenate([np.ones(0), *(g.factor for g in sensor_groups if g.factor is not None)])
 
 

@@ -35,6 +35,8 @@ class Target(ABC):
     seldom: ClassVar[tuple[str, ...]] = ()
 
     size_sigma: float = field(default=SIZE_SIGMA, kw_only=True)  # relative, common to all lengths; 0: exact
+    # (width, height) [m] of the flat sheet, x and y of its body, with the points in its middle; None: see `outlines`
+    sheet: tuple[float, float] | None = field(default=None, kw_only=True)
 
     @cached_property
     @abstractmethod
@@ -50,6 +52,24 @@ class Target(ABC):
     def radii(self) -> np.ndarray:
         """(n,) radius of the circle around each point [m]; 0 for points that are not centres of circles."""
         return np.zeros(len(self.points))
+
+    @property
+    def has_sheet(self) -> tuple[bool, ...]:
+        """Whether the size of each body's sheet is given, so that its edges are known."""
+        return (self.sheet is not None,) * len(self.bodies)
+
+    @cached_property
+    def outlines(self) -> np.ndarray:
+        """(bodies, 2, 2) least and greatest x and y [m] of the flat sheet of each body. Without `sheet` it is what the
+        points span, with the squares or circles around them."""
+        rim = getattr(self, "square_size", 0.0) + self.radii.max(initial=0.0)
+        out = np.empty((len(self.bodies), 2, 2))
+        for k in range(len(self.bodies)):
+            xy = self.points[self.body == k, :2]
+            low, high = xy.min(axis=0) - rim, xy.max(axis=0) + rim
+            middle, half = 0.5 * (low + high), 0.5 * (high - low if self.sheet is None else np.array(self.sheet))
+            out[k] = middle - half, middle + half
+        return out
 
     @cached_property
     def bodies(self) -> tuple[str, ...]:
@@ -80,7 +100,7 @@ class Target(ABC):
     def plain(self) -> dict[str, Any]:
         """Fields as in a rig file: text, numbers, lists. Empty lists are omitted, and so are `seldom` fields with
         default values."""
-        usual = {f.name: f.default for f in fields(self) if f.name in (*self.seldom, "size_sigma")}
+        usual = {f.name: f.default for f in fields(self) if f.name in (*self.seldom, "size_sigma", "sheet")}
         values = {f.name: getattr(self, f.name) for f in fields(self)}
         values = {name: value for name, value in values.items() if name not in usual or value != usual[name]}
         lists = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}

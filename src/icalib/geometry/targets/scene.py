@@ -76,6 +76,14 @@ class Scene(Target):
         pairs = zip(self.targets, self.first_points[:-1], strict=True)
         return np.concatenate([t.tag_number + first for t, first in pairs])
 
+    @property
+    def has_sheet(self) -> tuple[bool, ...]:
+        return tuple(has for t in self.targets for has in t.has_sheet)
+
+    @cached_property
+    def outlines(self) -> np.ndarray:
+        return np.concatenate([t.outlines for t in self.targets])
+
     @cached_property
     def bends(self) -> np.ndarray:
         return np.concatenate([t.bends for t in self.targets])

@@ -40,7 +40,7 @@ class LidarInspector(KindInspector):
     sensor: ClassVar[type[Sensor]] = Lidar
     topic_kinds: ClassVar[tuple[str, ...]] = ("points",)
     prefix: ClassVar[str] = "lidar"
-    plain_names: ClassVar[str] = r"scans\.npz|points(_raw)?"
+    plain_names: ClassVar[str] = r"scans\.npz|points(_raw)?|\*\.(pcd|ply|bin)"
     is_certain: ClassVar[bool] = True
     checks: ClassVar = {"use": refused}
 

@@ -9,10 +9,13 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel
+from icalib.motion.factor import Factor, Whitened, pairs_of
 from icalib.motion.point_planes import thinned
-from icalib.rig import Lidar, Rig
+from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
+from icalib.sensors.lidar.board_factor import ON_EDGES, BoardFactor
 from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.lidar.spec import RANGE_OFFSET
 
 # Isotropic noise in addition to stated range noise; without it beams parallel to a plane would have infinite weight.
 GRAZING_SIGMA_M = 1e-3
@@ -23,6 +26,11 @@ MIN_RANGE_SIGMA_M = 1e-3  # of estimated noise: keeps weights of simulated point
 class LidarModel(SensorModel[Lidar, LidarNoise]):
     """Sensor model of a LiDAR, used once planes are known. Stated noise is along the beam; estimated noise is
     isotropic."""
+
+    def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig) -> bool:
+        """See `SensorModel`. Only sheets whose distance is known from images show a range offset."""
+        at_rest = rig.imu is None and rig.has_target
+        return super().is_estimated(sensor, spec, rig) and (spec is not RANGE_OFFSET or at_rest)
 
     def first_noise(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> dict[str, LidarNoise]:
         loss, scale = rig.settings.loss, rig.settings.loss_scale
@@ -37,21 +45,30 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     def next_noise(
         self, sensors: Sequence[Lidar], noise: Mapping[str, LidarNoise], end: PassEnd
     ) -> dict[str, LidarNoise]:
-        """The noise scaled by the RMS of the whitened distances, unless the rig file states it."""
+        """The noise scaled by the RMS of the whitened distances, unless the rig file states it. At rest, see
+        `_on_boards`."""
         next_noise = {s.name: noise[s.name] for s in sensors}
         for sensor in sensors:
             points = end.of(sensor.name).squares.get("points") if sensor.range_noise_m is None else None
             if points is not None:
                 sigma = noise[sensor.name].sigma * float(np.sqrt(points.chi2 / points.n))
                 next_noise[sensor.name] = replace(noise[sensor.name], sigma=max(sigma, MIN_RANGE_SIGMA_M))
+        for factor, out in pairs_of(end.factors, end.residuals, BoardFactor):
+            sensor = next(s for s in sensors if s.name == factor.name)
+            next_noise[sensor.name] = _on_boards(sensor, next_noise[sensor.name], factor, out)
         return next_noise
 
     def passes(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> int:
+        if rig.imu is None and rig.has_target:
+            return 2  # the first estimate of errors that points share is rough
         return int(any(s.range_noise_m is None for s in sensors))
 
-    def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[LidarFactor]:
-        """One factor for all points on planes. Coarse passes use fewer points and longer bins."""
-        assert at.motion is not None
+    def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[Factor]:
+        """One factor for all points on planes, at rest for those on the target. Coarse passes use fewer points and
+        longer bins."""
+        if at.motion is None:
+            yield from BoardFactor.build(stream, noise, at)
+            return
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
@@ -61,6 +78,18 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         """See `binning.points_on_planes`."""
         assert at.motion is not None
         return points_on_planes(at.motion, stream, _plane(sensor, at))
+
+
+def _on_boards(sensor: Lidar, noise: LidarNoise, factor: BoardFactor, out: Whitened) -> LidarNoise:
+    """The noise with what the residuals `out` of one factor show: of rings, or of points unless the rig file states it,
+    and how far errors of the points at a stop correlate."""
+    if factor.kind == ON_EDGES:
+        weight = out.root[:, 0] ** 2
+        sigma = float(np.sqrt(weight @ factor.raw(out)[:, 0] ** 2 / max(weight.sum(), 1.0)))
+        return replace(noise, edge_sigma=max(sigma, MIN_RANGE_SIGMA_M))
+    sigma, inflation = factor.noise_sizes(out)
+    noise = replace(noise, inflation=inflation)
+    return noise if sensor.range_noise_m is not None else replace(noise, sigma=max(sigma, MIN_RANGE_SIGMA_M))
 
 
 def _plane(sensor: Lidar, at: Pass) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -15,8 +16,21 @@ from icalib.sensors.fields import (
     positive_or,
     topic_or_none,
 )
-from icalib.sensors.sensor import MountedSensor, TimeUnit
+from icalib.sensors.parameter import Parameter, ParameterSpec
+from icalib.sensors.sensor import MOUNTED, Lack, MountedSensor, Sensor, TimeUnit
 
+RANGE_OFFSET = ParameterSpec(
+    name="range_offset",
+    size=1,
+    manifold="vector",
+    unit="m",
+    labels=("range_offset",),
+    tolerance=5e-3,
+    prior_sigma=0.03,  # range accuracy that data sheets of spinning LiDARs state, as the VLP-16's
+    is_auxiliary=True,
+    meaning="what the LiDAR measures too much, the same at all ranges",
+    motion="show the board nearer and farther",
+)
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
@@ -39,6 +53,7 @@ class Lidar(MountedSensor):
         "or run LiDAR odometry, and give its nav_msgs/Odometry as a sensor of type: pose, kind: relative"
     )
     shows_planes: ClassVar[bool] = True
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, RANGE_OFFSET)
 
     path: str
     range_noise_m: float | None = None  # sigma along the beam; None: estimated from the residuals
@@ -48,6 +63,7 @@ class Lidar(MountedSensor):
     topic: str | None = None  # topic of the clouds; None: the topic with the LiDAR's name, or the only one
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
+    range_offset: Parameter = Parameter()
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Lidar:
@@ -77,6 +93,12 @@ class Lidar(MountedSensor):
         given = {"range_noise": self.range_noise_m, "topic": self.topic}
         given |= {name: getattr(self, name) for name in ("point_time_field", "point_time_unit")}
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        """See `Sensor`. Beside cameras alone that see a target no IMU is needed, if all stand still."""
+        beside_cameras = all(s.sees_target or s.shows_planes for s in sensors.values())
+        if not (has_target and beside_cameras and any(s.sees_target for s in sensors.values())):
+            yield from super().lacks(sensors, has_target)
 
 
 def _point_time(fields: dict[str, YamlValue]) -> PointTime:

@@ -20,6 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.base.files import VIDEO_FILE
+from icalib.data.folder import CLOUD_FILES
 from icalib.data.messages import listing, type_not_read
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.data.stamps import longest_part
@@ -316,7 +317,7 @@ class KindInspector:
 
     def _draft_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         for name, source in inspection.sources.of(self.sensor.sensor_type).items():
-            if self.sensor.needs_imu and not inertial(inspection):
+            if self.sensor.needs_imu and not inertial(inspection) and not beside_target(inspection, name):
                 continue
             is_active, topic = active or self.is_certain, source.topic
             yield from (f"  # {line}" for line in self.doubt if not is_active)
@@ -369,6 +370,11 @@ def independent(inspection: Inspection) -> tuple[str, ...]:
 def dependent(inspection: Inspection, accepted: Callable[[KindInspector], object] = lambda _: True) -> tuple[str, ...]:
     """Names of sensors that need a sensor of another kind, if their kind is `accepted`; without IMUs."""
     return named(inspection, lambda kind: not (kind.sensor.is_inertial or kind.alone) and accepted(kind))
+
+
+def beside_target(inspection: Inspection, name: str) -> bool:
+    """Whether the sensor was at rest, beside cameras that may see a target: its clouds are files."""
+    return bool(independent(inspection)) and inspection.sources.sensors[name].topic.type == CLOUD_FILES
 
 
 def problem_of(inspection: Inspection, name: str) -> str:
@@ -544,6 +550,12 @@ def _beside_an_imu(inspection: Inspection, topic_list: str) -> Iterator[Finding]
 
 def _independent_without_imu(inspection: Inspection, topic_list: str) -> Finding:
     kind = inspectors()[inspection.sources.sensors[independent(inspection)[0]].kind]
+    if at_rest := [name for name in dependent(inspection) if beside_target(inspection, name)]:
+        return Finding(
+            "hint",
+            f"Each image is taken as a stop at which the rig stands still, with the cloud of {' and '.join(at_rest)} "
+            f"of the same number or stamp; the target must be in both.",
+        )
     others = [*without_imu(inspection), *(f"frames of {topic}" for topic in inspection.moving_frames)]
     if others:
         return Finding(

@@ -18,9 +18,11 @@ from icalib.initialize.initializer import (
     Values,
     stated_values,
 )
+from icalib.initialize.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.initialize.association import lidar_values, state_from_lidar, with_lidars
+from icalib.sensors.lidar.initialize.boards import guess_at_rest, is_at_rest
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error
 
@@ -59,6 +61,17 @@ class LidarInitializer(Initializer[Lidar]):
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)
         return replace(inputs, guess=guess), state, known
+
+    def start_at_rest(
+        self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
+    ) -> InitialGuess | None:
+        """See `Initializer`: by the target in images and clouds. Raises EstimationError if the rig moved."""
+        if is_at_rest(rig, body_poses):
+            return guess_at_rest(rig, recordings, body_poses, values)
+        raise EstimationError(
+            f"{rig.lidars[0].name}: without an IMU the rig must stand still at each image, with cameras and LiDARs "
+            "only; take one image and one cloud at each stop, or add a sensor of type: imu."
+        )
 
     def explained(self, failed: FailedEstimate) -> EstimationError | None:
         """See `Initializer`: during an attempt, the error that names a degenerate scene."""

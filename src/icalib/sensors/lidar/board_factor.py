@@ -1,0 +1,298 @@
+"""The factors of points of one LiDAR on the sheets of the target that cameras see, and of rings on these sheets.
+
+    off(x) = n . R_scene_body^T (R_scene_lidar x (1 - range_offset / |x|) + p_scene_lidar - p_scene_body) - reach
+
+The print of each body is in its plane z = 0, n = (0, 0, 1), whose pose the corners in the images give: no plane is
+estimated. The residual of a point is off(x), its distance from the sheet. range_offset [m] is what the LiDAR measures
+too much, the same for all points.
+
+If the size of the sheet is given, its edges are planes at right angles to it, with outward normals n. A ring crosses
+two of them, at x and y. Its residual is (off(y) - off(x)) / 2: how far the middle of its part on the sheet is off. Wide
+beams, and beams a little too high or low, shift both ends outwards or inwards alike, which cancels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from icalib.data.measurements import LidarStream
+from icalib.errors import EstimationError
+from icalib.model.bodies import Bodies
+from icalib.model.sensor_model import Pass
+from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
+from icalib.motion.imu_data import ImuData
+from icalib.motion.poses import MERGED_WITHIN_S, instants
+from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
+from icalib.optim.arrowhead import Piece
+from icalib.optim.rows import Rows
+from icalib.optim.state import Layout, State
+from icalib.sensors.lidar.binning import LidarNoise
+from icalib.sensors.lidar.spec import RANGE_OFFSET
+
+# Points nearer to the rim of the sheet are not used: their beams (some 3 mrad wide, 1 cm at 3 m) miss it in part.
+RIM_M = 0.02
+ON_BOARDS, ON_EDGES = "points on boards", "rings on boards"  # kinds of residuals
+GATE_SIGMAS = 4.0  # largest distance of a used point from its sheet, in standard deviations of the noise
+
+
+@dataclass(frozen=True)
+class BoardPoints:
+    """Points of one LiDAR on planes of the target, sorted by keyframe. seconds (n,): since the first stamp, on the
+    LiDAR's clock; xyz (n, 3) m; keyframe (n,); body (n,): index of the body of the target. normal (n, 3), reach (n,) m:
+    of the plane, in the frame of the body; normal . x = reach on the plane."""
+
+    seconds: np.ndarray
+    xyz: np.ndarray
+    keyframe: np.ndarray
+    body: np.ndarray
+    normal: np.ndarray
+    reach: np.ndarray
+
+    @classmethod
+    def of(cls, stream: LidarStream, bodies: Bodies, state: State, gate_m: float) -> tuple[BoardPoints, BoardPoints]:
+        """Points on the sheets, and points where rings cross their edges, of the scans at keyframes. gate_m: largest
+        distance from a sheet, at `state`."""
+        times = instants(stream, state.values)
+        keyframe = np.searchsorted(0.5 * (state.seconds[1:] + state.seconds[:-1]), times)
+        at_keyframe = np.abs(times - state.seconds[keyframe]) <= MERGED_WITHIN_S
+        R, p = bodies.poses(state.values)
+        sheets, edges = [], []
+        for scan in np.flatnonzero(at_keyframe):
+            xyz = stream.xyz[stream.start[scan] : stream.start[scan + 1]].astype(np.float64)
+            k = np.full(len(xyz), keyframe[scan])
+            world = in_scene(xyz, stream.name, k, state)
+            for b in bodies.used:
+                places = np.array([scan, keyframe[scan], b])
+                y, outline = (world - p[b]) @ R[b], bodies.target.outlines[b]
+                used = xyz[on_sheet(y, outline, -RIM_M, gate_m)]
+                sheets.append((np.tile(places, (len(used), 1)), used, np.tile([0.0, 0.0, 1.0, 0.0], (len(used), 1))))
+                if bodies.target.has_sheet[b]:
+                    at, plane = edge_points(xyz, y, outline, gate_m)
+                    edges.append((np.tile(places, (len(at), 1)), at, plane))
+        return cls._joined(stream, sheets), cls._joined(stream, edges)
+
+    @classmethod
+    def _joined(cls, stream: LidarStream, parts: Sequence[tuple[np.ndarray, ...]]) -> BoardPoints:
+        none = np.zeros((0, 3), int), np.zeros((0, 3)), np.zeros((0, 4))
+        places, xyz, plane = (np.concatenate(x) for x in zip(none, *parts, strict=True))
+        order = np.argsort(places[:, 1], kind="stable")
+        places, xyz, plane = places[order], xyz[order], plane[order]
+        scan, keyframe, body = places.T
+        return cls(stream.seconds[scan], xyz, keyframe, body, plane[:, :3], plane[:, 3])
+
+
+def elevations(xyz: np.ndarray) -> np.ndarray:
+    """(n,) elevations of points xyz (n, 3) above the LiDAR's x-y plane [rad]."""
+    return np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+
+
+def in_scene(xyz: np.ndarray, lidar: str, keyframe: np.ndarray, state: State) -> np.ndarray:
+    """(n, 3) points xyz (n, 3) m of a LiDAR, each at its `keyframe` (n,), in the frame of the scene."""
+    v = state.values
+    offset = v[lidar, RANGE_OFFSET.name][0] / np.linalg.norm(xyz, axis=1, keepdims=True)
+    on_body = (1.0 - offset) * xyz @ v[lidar, "rotation"].T + v[lidar, "translation"]
+    return np.einsum("nij,nj->ni", state.rotation[keyframe], on_body) + state.position[keyframe]
+
+
+def on_sheet(points: np.ndarray, outline: np.ndarray, margin_m: float, gate_m: float) -> np.ndarray:
+    """(n,) bool: points (n, 3) in the frame of a body inside the outline of its sheet, grown by margin_m."""
+    xy, (low, high) = points[:, :2], outline
+    inside = (xy > low - margin_m).all(axis=1) & (xy < high + margin_m).all(axis=1)
+    return inside & (np.abs(points[:, 2]) < gate_m)
+
+
+# Where rings of a spinning LiDAR cross the edges of a sheet: half a step beyond the last beam that hits it.
+
+RING_GAP_RAD = np.deg2rad(0.08)  # elevations of rings are farther apart: 0.11 deg in the densest LiDARs of 128 rings
+EDGE_GATE_M = 0.06  # largest distance of a crossing from the outline
+FEWEST_ON_RING = 6
+END_POINTS = 6  # last points of a ring on the sheet, whose line gives the range at the edge
+MOST_GRAZING = 0.5  # cosine of the smallest angle at which a ring crosses an edge
+
+
+def edge_points(
+    xyz: np.ndarray, in_body: np.ndarray, outline: np.ndarray, gate_m: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (e, 3) where rings cross the edges of a sheet, in the frame of the LiDAR; and the edges (e, 4): outward
+    normal in the frame of the body, and its distance from the body's origin. xyz, in_body (N, 3): all points of a scan
+    in both frames."""
+    near = np.flatnonzero(on_sheet(in_body, outline, EDGE_GATE_M, np.inf))
+    elevation = elevations(xyz[near])
+    order = np.argsort(elevation)
+    points, planes = [np.zeros((0, 3))], [np.zeros((0, 4))]
+    for ring in np.split(near[order], np.flatnonzero(np.diff(elevation[order]) > RING_GAP_RAD) + 1):
+        ends = _ends_of_ring(xyz, in_body, ring, outline, gate_m)
+        if ends is not None:
+            points.append(ends[0])
+            planes.append(ends[1])
+    return np.concatenate(points), np.concatenate(planes)
+
+
+def _ends_of_ring(
+    xyz: np.ndarray, in_body: np.ndarray, ring: np.ndarray, outline: np.ndarray, gate_m: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Both ends of a ring on a sheet: points (2, 3) and edges (2, 4) as in `edge_points`; None if it has none."""
+    hits = ring[on_sheet(in_body[ring], outline, EDGE_GATE_M, gate_m)]
+    if len(hits) < FEWEST_ON_RING:
+        return None
+    x, y = xyz[hits, :2].mean(axis=0)
+    azimuth = np.arctan2(x * xyz[hits, 1] - y * xyz[hits, 0], x * xyz[hits, 0] + y * xyz[hits, 1])
+    order = np.argsort(azimuth)
+    hits, azimuth = hits[order], azimuth[order]
+    both, step = np.concatenate([xyz[hits], in_body[hits]], axis=1), float(np.median(np.diff(azimuth)))
+    ends = []
+    for sign, end in ((-1.0, slice(0, END_POINTS)), (1.0, slice(-END_POINTS, None))):
+        at = azimuth[0 if sign < 0.0 else -1] + 0.5 * sign * step
+        slope, value = np.polyfit(azimuth[end] - at, both[end], 1)
+        edge = _edge(value[3:5], sign * slope[3:5] / np.linalg.norm(slope[3:5]), outline)
+        if edge is None:
+            return None
+        ends.append((value[:3], edge))
+    points, edges = (np.array(x) for x in zip(*ends, strict=True))
+    return points, edges
+
+
+def _edge(at: np.ndarray, along: np.ndarray, outline: np.ndarray) -> np.ndarray | None:
+    """The edge (4,) that a ring leaves at `at` (2,) in the direction `along` (2,); None near corners, or far off."""
+    low, high = outline
+    apart = np.array([low[0] - at[0], low[1] - at[1], at[0] - high[0], at[1] - high[1]])
+    normals = np.array([[-1.0, 0.0], [0.0, -1.0], [1.0, 0.0], [0.0, 1.0]])
+    k = int(np.argmax(apart))
+    others = np.delete(apart, [k, (k + 2) % 4])
+    if abs(apart[k]) > EDGE_GATE_M or (others > -EDGE_GATE_M).any() or normals[k] @ along < MOST_GRAZING:
+        return None
+    return np.array([*normals[k], 0.0, (normals[k] * np.where(k < 2, low, high)).sum()])
+
+
+@dataclass(frozen=True)
+class BoardFactor(RowFactor):
+    """Points of one LiDAR on sheets of the target, or pairs of points where a ring crosses their edges. kind: of the
+    residuals, ON_BOARDS or ON_EDGES; sigma (m,) m of each residual; starts: first keyframe of each recording."""
+
+    is_sparse: ClassVar[bool] = False
+    units: ClassVar[Mapping[str, str]] = {ON_BOARDS: "m", ON_EDGES: "m"}
+
+    name: str
+    kind: str
+    points: BoardPoints
+    sigma: np.ndarray
+    noise: LidarNoise
+    bodies: Bodies
+    starts: tuple[int, ...]
+    n_keyframes: int
+    layout: Layout
+    imu: ImuData | None = None
+    gravity: float = 0.0
+
+    @classmethod
+    def build(cls, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[BoardFactor]:
+        """The factors of a pass. Raises EstimationError if no point lies on a sheet."""
+        gate_m = GATE_SIGMAS * float(np.hypot(noise.sigma, noise.beam_sigma))
+        for kind, points in zip(
+            (ON_BOARDS, ON_EDGES), BoardPoints.of(stream, at.bodies, at.state, gate_m), strict=True
+        ):
+            n, count = len(points.xyz), len(at.state.seconds)
+            if kind == ON_BOARDS and not n:
+                raise EstimationError(
+                    f"{stream.name}: no point lies on the target; check that it is in the field of view of "
+                    f"{stream.name}, and the extrinsics in the rig file."
+                )
+            one = cls(stream.name, kind, points, np.ones(n), noise, at.bodies, at.starts, count, at.layout, at.imu)
+            cosine = one.rows_of_points(slice(None), at.state, True)[1]
+            sigma = noise.inflation * np.sqrt(noise.sigma**2 + (noise.beam_sigma * cosine) ** 2)
+            if n:
+                yield replace(one, sigma=sigma if kind == ON_BOARDS else np.full(n // 2, noise.edge_sigma))
+
+    def noise_sizes(self, out: Whitened) -> tuple[float, float]:
+        """Standard deviation [m] of points about the plane that fits them best at one stop, and how many times larger
+        it is in what these planes show: offset and two tilts against the sheet. At least 1, if errors of the points at
+        a stop correlate."""
+        raw, root = self.raw(out)[:, 0], out.root[:, 0]
+        squares, planes, n = np.zeros(2), 0, 0
+        for stop in np.split(np.arange(len(raw)), np.flatnonzero(np.diff(self.points.keyframe)) + 1):
+            x = self.points.xyz[stop] - self.points.xyz[stop].mean(axis=0)
+            axes = np.linalg.svd(x, full_matrices=False)[2][:2]
+            basis, _ = np.linalg.qr(root[stop, None] * np.column_stack([np.ones(len(x)), x @ axes.T]))
+            weighted = root[stop] * raw[stop]
+            along = basis.T @ weighted
+            squares += along @ along, weighted @ weighted - along @ along
+            planes, n = planes + basis.shape[1], n + max(len(x) - basis.shape[1], 0)
+        sigma = float(np.sqrt(squares[1] / max(n, 1)))
+        return sigma, max(1.0, float(np.sqrt(squares[0] / planes)) / max(sigma, 1e-9))
+
+    @property
+    def key(self) -> FactorKey:
+        return self.name, self.kind
+
+    @property
+    def kinds(self) -> dict[str, slice]:
+        return {self.kind: slice(0, 1)}
+
+    def output(self) -> Whitened:
+        return Whitened.empty(len(self.sigma), 1)
+
+    def times(self, state: State) -> np.ndarray:
+        return state.seconds[self.keyframe]
+
+    def raw(self, out: Whitened) -> np.ndarray:
+        return out.residual * self.sigma[:, None]
+
+    def raw_sigma(self) -> np.ndarray:
+        return self.sigma[:, None]
+
+    @cached_property
+    def _columns(self) -> np.ndarray:
+        """Calibration columns of the LiDAR's pose, its range offset, and the poses of all bodies."""
+        offset = self.layout.columns(self.name, RANGE_OFFSET.name)
+        poses, _ = self.bodies.columns(self.layout)
+        return np.concatenate([Kinematics.of(self).columns(), offset, poses.ravel()])
+
+    @cached_property
+    def keyframe(self) -> np.ndarray:
+        """(m,) keyframe of each row: of a point, or of both ends of a ring."""
+        return self.points.keyframe[:: self.points_per_row]
+
+    @property
+    def points_per_row(self) -> int:
+        return 2 if self.kind == ON_EDGES else 1
+
+    def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
+        """See `Factor`."""
+        total, into, step = 0.0, Into(piece, out, sums, curved), self.points_per_row
+        for _, block in rows_by_recording(self.keyframe, self.starts, self.n_keyframes, piece):
+            rows, _ = self.rows_of_points(slice(step * block.start, step * block.stop), state, sums)
+            if self.kind == ON_EDGES:
+                rows = Rows(*(0.5 * (x[1::2] - x[::2]) for x in rows))
+            interval = rows.on_intervals(self.keyframe[block], self.n_keyframes)
+            noise = RobustNoise(1.0 / self.sigma[block][:, None, None], self.noise.loss, self.noise.loss_scale)
+            total += add_rows(rows, block, interval, self._columns, noise, into)
+        return total
+
+    def rows_of_points(self, block: slice, state: State, jacobians: bool) -> tuple[Rows, np.ndarray]:
+        """Distances of the points `block` from their planes and their Jacobians; and cosines (n,) of the beams with the
+        normals of these planes."""
+        p = self.points
+        x, body, of_body = p.xyz[block], p.body[block], p.normal[block]
+        at = SensorPose.at(Kinematics.of(self), p.seconds[block], p.keyframe[block], state, jacobians)
+        beam = x / np.linalg.norm(x, axis=1, keepdims=True)
+        x = x - state.values[self.name, RANGE_OFFSET.name][0] * beam
+        R, origin = self.bodies.poses(state.values)
+        in_scene = np.einsum("nij,nj->ni", R[body], of_body)
+        normal = np.einsum("nij,ni->nj", at.rotation, in_scene)  # in axes of the LiDAR
+        y = np.einsum("nij,nj->ni", at.rotation, x) + at.position - origin[body]
+        residual = (in_scene * y).sum(axis=1) - p.reach[block]
+        cosine = (normal * beam).sum(axis=1)
+        if not jacobians:
+            return Rows(residual[:, None], np.zeros((0, 1, 0))), cosine
+        J_further = np.zeros((len(x), 1, 1 + self.bodies.columns(self.layout)[0].size))
+        J_further[:, 0, 0] = -cosine
+        if self.bodies.several:
+            J_body = np.concatenate([np.cross(of_body, np.einsum("nij,ni->nj", R[body], y)), -in_scene], axis=1)
+            J_further[np.arange(len(x))[:, None], 0, 1 + 6 * body[:, None] + np.arange(6)] = J_body
+        J_pose = np.concatenate([np.cross(x, normal), normal], axis=1)[:, None, :]
+        return rows_at(residual[:, None], (J_pose,), (at,), J_further), cosine

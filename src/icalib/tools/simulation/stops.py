@@ -1,0 +1,129 @@
+"""Simulated recordings of a camera and a LiDAR that stand still while a board is in several places.
+
+Each place is a stop: an image of the corners, and a cloud of the board and of the walls of a room. Formulas are the
+obvious ones, by rays and planes in the frame of the camera; none is the estimator's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from icalib.data.measurements import LidarStream, Measurements
+from icalib.geometry.targets import Checkerboard, Target
+from icalib.rig import Camera, Lidar, Parameter, Rig, Settings, by_name
+from icalib.sensors.camera.stream import CornerStream
+from icalib.tools.simulation.motion import rotation_from_vector
+from icalib.tools.simulation.projection import project, visible
+from icalib.tools.simulation.scenario import SimCamera
+
+_STOP_NS = 1_000_000_000  # between stops
+# From LiDAR axes (x ahead, y left) to those of a camera that looks ahead (x right, y down), a little askew.
+_AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def _t_cam_lidar() -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = rotation_from_vector(np.deg2rad([3.0, -4.0, 2.0])) @ _AXES
+    T[:3, 3] = 0.03, -0.16, -0.09
+    return T
+
+
+def _camera() -> SimCamera:
+    fisheye = (-0.05, -0.08, 0.1, -0.05)
+    return SimCamera("cam0", "pinhole-equidistant", (1920, 1208), (1177.0, 1178.0, 962.0, 613.0), fisheye, np.eye(4))
+
+
+@dataclass(frozen=True)
+class Stops:
+    """A rig at rest: camera, LiDAR and board. board_angles_deg: largest tilt of the board from facing the camera about
+    each of its axes; distance_m: between camera and board. range_noise_m, range_offset_m: along the beam. room_m: from
+    the camera to the walls. panels: T_cam_panel (n, 4, 4) of flat objects as large as the sheet."""
+
+    n_stops: int = 10
+    camera: SimCamera = field(default_factory=_camera)
+    T_cam_lidar: np.ndarray = field(default_factory=_t_cam_lidar)
+    target: Target = field(default_factory=lambda: Checkerboard(7, 6, 0.095, sheet=(0.7, 0.85)))
+    board_angles_deg: tuple[float, float, float] = (40.0, 40.0, 30.0)
+    distance_m: tuple[float, float] = (1.5, 3.5)
+    rings: int = 16
+    azimuth_steps: int = 1800
+    elevation_deg: tuple[float, float] = (-15.0, 15.0)
+    range_noise_m: float = 0.02
+    range_offset_m: float = 0.0
+    room_m: float = 5.0
+    panels: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+
+    def rig(self, knows_lens: bool = True) -> Rig:
+        """The rig that a user would write, without any true value but, if `knows_lens`, those of the lens."""
+        c, sheet = self.camera, replace(self.target, size_sigma=0.0)
+        lens = [Parameter("fixed", np.array(x)) if knows_lens else Parameter() for x in (c.intrinsics, c.distortion)]
+        camera = Camera(c.name, "", c.model, c.resolution, c.corner_noise_px, lens[0], lens[1])
+        settings = Settings(loss="none", outlier_std=0.0, bloom=False, board_shape=False, blur_noise=False, segments=0)
+        return Rig(by_name(camera, Lidar("lidar0", "", self.range_noise_m)), sheet, settings=settings)
+
+
+def simulate_stops(stops: Stops, seed: int) -> tuple[Measurements, np.ndarray]:
+    """Corners and clouds of all stops, and the poses T_cam_board (n_stops, 4, 4) of the board."""
+    rng = np.random.default_rng(seed)
+    boards = np.array([_board_pose(stops, rng) for _ in range(stops.n_stops)])
+    stamps_ns = _STOP_NS * np.arange(1, stops.n_stops + 1)
+    corners, points = zip(*(_corners(stops, T, rng) for T in boards), strict=True)
+    clouds = [_cloud(stops, T, rng) for T in boards]
+    starts = [np.cumsum([0, *(len(x) for x in each)]).astype(np.int64) for each in (corners, clouds)]
+    camera = CornerStream(stops.camera.name, stamps_ns, starts[0], np.concatenate(points), np.concatenate(corners))
+    xyz = np.concatenate(clouds).astype(np.float32)
+    zeros, none = np.zeros(len(xyz), np.float32), np.full(len(xyz), -1, np.int32)
+    lidar = LidarStream("lidar0", stamps_ns, starts[1], zeros, xyz, none)
+    return Measurements.of_streams(camera, lidar), boards
+
+
+def _board_pose(stops: Stops, rng: np.random.Generator) -> np.ndarray:
+    """A pose of the board all of whose corners the camera sees, and at which the LiDAR looks."""
+    middle = np.append(stops.target.outlines[0].mean(axis=0), 0.0)
+    turned = np.diag([1.0, -1.0, -1.0])  # z of the board towards the camera, its y up
+    while True:
+        T = np.eye(4)
+        T[:3, :3] = turned @ rotation_from_vector(np.deg2rad(stops.board_angles_deg) * rng.uniform(-1.0, 1.0, 3))
+        distance = rng.uniform(*stops.distance_m)
+        direction = np.array([*rng.uniform(-0.5, 0.5, 2), 1.0])
+        T[:3, 3] = distance * direction / np.linalg.norm(direction) - T[:3, :3] @ middle
+        in_camera = stops.target.points @ T[:3, :3].T + T[:3, 3]
+        low, high = np.deg2rad(stops.elevation_deg)
+        x, y, z = stops.T_cam_lidar[:3, :3].T @ (T[:3, :3] @ middle + T[:3, 3] - stops.T_cam_lidar[:3, 3])
+        if visible(stops.camera, in_camera, project(stops.camera, in_camera)).all() and (
+            low < np.arctan2(z, np.hypot(x, y)) < high
+        ):
+            return T
+
+
+def _corners(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Noisy image points (n, 2) of all corners, and their numbers (n,)."""
+    uv = project(stops.camera, stops.target.points @ T_cam_board[:3, :3].T + T_cam_board[:3, 3])
+    return uv + stops.camera.corner_noise_px * rng.standard_normal(uv.shape), np.arange(len(uv))
+
+
+def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """(N, 3) measured points in the frame of the LiDAR: each beam ends at the board, a panel or a wall."""
+    azimuth = 2.0 * np.pi * np.arange(stops.azimuth_steps)[:, None] / stops.azimuth_steps
+    elevation = np.deg2rad(np.linspace(*stops.elevation_deg, stops.rings))
+    axes = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation) + 0.0 * azimuth
+    beams = np.stack(axes, axis=2).reshape(-1, 3)
+    R, origin = stops.T_cam_lidar[:3, :3], stops.T_cam_lidar[:3, 3]
+    rays = beams @ R.T
+    ahead = np.where(rays > 0.0, 1.0, -1.0) * stops.room_m - origin
+    distance = (ahead / np.where(rays == 0.0, 1e-12, rays)).min(axis=1)
+    for T in (T_cam_board, *stops.panels):
+        distance = np.minimum(distance, _to_sheet(T, stops.target.outlines[0], origin, rays))
+    measured = distance + stops.range_offset_m + stops.range_noise_m * rng.standard_normal(len(distance))
+    return beams * measured[:, None]
+
+
+def _to_sheet(T: np.ndarray, outline: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """(n,) distances from `origin` (3,) along `rays` (n, 3) to a sheet at T (4, 4); infinite where they miss it."""
+    normal = T[:3, 2]
+    distance = (normal @ (T[:3, 3] - origin)) / (rays @ normal)
+    xy = ((origin + distance[:, None] * rays - T[:3, 3]) @ T[:3, :3])[:, :2]
+    hit = (distance > 0.0) & (xy > outline[0]).all(axis=1) & (xy < outline[1]).all(axis=1)
+    return np.where(hit, distance, np.inf)

@@ -1,0 +1,90 @@
+"""A fisheye camera and a VLP-16 that stood still, a checkerboard in 20 places: the pose of the LiDAR from nothing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from icalib.cli import main
+from icalib.data.measurements import Measurements
+from icalib.pipeline import calibrate_measurements, measure
+from icalib.rig.file import load_rig
+
+pytestmark = pytest.mark.slow
+
+
+@dataclass(frozen=True)
+class LidarPose:
+    """T_cam_lidar (3, 4) and its standard deviations, rad and m."""
+
+    T: np.ndarray
+    rotation_std: np.ndarray
+    translation_std: np.ndarray
+
+
+@pytest.fixture(scope="module")
+def reference(camera_lidar_board):
+    return yaml.safe_load((camera_lidar_board / "reference.yaml").read_text())
+
+
+@pytest.fixture(scope="module")
+def recorded(camera_lidar_board, reference, tmp_path_factory):
+    """The rig of the draft that `icalib inspect` writes for the folder, and its measurements."""
+    folder = tmp_path_factory.mktemp("board")
+    (folder / "target.yaml").write_text(yaml.safe_dump(reference["target"]))
+    given = ["--target", str(folder / "target.yaml"), "--rig", str(folder / "rig.yaml"), "-q"]
+    assert main(["inspect", str(camera_lidar_board), *given]) == 0
+    rig = load_rig(folder / "rig.yaml")
+    (measurements,) = measure(rig, camera_lidar_board)
+    return rig, measurements
+
+
+def lidar_pose(rig, measurements) -> LidarPose:
+    result = calibrate_measurements(rig, measurements)
+    rotation, translation = result.group("lidar0", "rotation"), result.group("lidar0", "translation")
+    return LidarPose(np.column_stack([rotation.value, translation.value]), rotation.std, translation.std)
+
+
+def apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation vector (3,) [rad] and translation (3,) [m] between two poses (3, 4)."""
+    return Rotation.from_matrix(a[:, :3].T @ b[:, :3]).as_rotvec(), b[:, 3] - a[:, 3]
+
+
+def stops(measurements: Measurements, kept: slice) -> Measurements:
+    """The measurements of some stops."""
+    (corners,), (cloud,) = measurements.cameras, measurements.lidars
+    stamps_ns = corners.stamps_ns[kept]
+    is_kept, count = np.isin(corners.stamps_ns, stamps_ns), np.diff(corners.start)
+    images = corners.of_rows(np.repeat(is_kept, count), stamps_ns, count[is_kept])
+    is_kept, count = np.isin(cloud.stamps_ns, stamps_ns), np.diff(cloud.start)
+    points = cloud.some(np.repeat(is_kept, count))
+    start = np.concatenate([[0], np.cumsum(count[is_kept])])
+    return Measurements.of_streams(images, replace(points, stamps_ns=cloud.stamps_ns[is_kept], start=start))
+
+
+def test_the_draft_has_a_fisheye_and_a_lidar(recorded):
+    rig, _ = recorded
+    assert [type(s).__name__ for s in rig.sensors.values()] == ["Camera", "Lidar"]
+    assert rig.cameras[0].model == "pinhole-equidistant"
+
+
+def test_the_pose_is_the_published_one(recorded, reference):
+    pose = lidar_pose(*recorded)
+    turn, shift = apart(pose.T, np.array(reference["T_cam_lidar_published"]))
+    assert np.rad2deg(np.linalg.norm(turn)) < 0.6
+    assert np.linalg.norm(shift) < 0.03
+
+
+@pytest.mark.full
+def test_halves_agree(recorded):
+    rig, measurements = recorded
+    even, odd = (lidar_pose(rig, stops(measurements, slice(k, None, 2))) for k in range(2))
+    turn, shift = apart(even.T, odd.T)
+    assert np.rad2deg(np.linalg.norm(turn)) < 0.3
+    assert np.linalg.norm(shift) < 0.015
+    assert (np.abs(turn) < 3.0 * np.hypot(even.rotation_std, odd.rotation_std)).all()
+    assert (np.abs(shift) < 3.0 * np.hypot(even.translation_std, odd.translation_std)).all()
