@@ -16,6 +16,7 @@ import numpy as np
 from icalib.data.measurements import Measurements
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, NoTarget, Target
 from icalib.rig import Ground, Rig, Settings
+from icalib.sensors.imu.simulate import SimImu
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.position.simulate import SimPositions
@@ -307,6 +308,14 @@ def _hand_eye(inverted: bool = False) -> Case:
 # Wrong rigs and recordings.
 
 
+def _several_imus() -> Inputs:
+    """A second IMU, with a clock of its own that starts late, as the body of a rig with a camera and a target."""
+    base = handheld(12.0)
+    second = SimImu("imu1", _pose(0.4, 0.12, -0.08, 0.05), 0.0123, 333.0, 1.5, base.imu_clock_origin_ns)
+    scenario = replace(base, cameras=base.cameras[:1]).with_sensors(second)
+    return _simulated(scenario, replace(_rig(scenario), body="imu1"))
+
+
 def _wrong_lens() -> Inputs:
     """The rig file fixes the focal lengths of cam0 at wrong values."""
     scenario = handheld(10.0)
@@ -352,4 +361,5 @@ CASES: dict[str, Case] = {
     "wrong-rig-file": _from_text(MISSPELT, "data/euroc_imu_april"),
     "refused-recording": _from_text(WHEEL_MOCAP, "data/euroc_imu_april"),
     "refused-poses": _hand_eye(inverted=True),
+    "several-imus": _several_imus,
 }
