@@ -162,7 +162,7 @@ def sensor_intrinsics(c: Calibration) -> list[str]:
 
 
 def imu_values(c: Calibration, imu: str | None) -> np.ndarray:
-    """(24,) intrinsics of an IMU (see `motion.imu_model`), zeros without any."""
+    """(24,) intrinsics of an IMU (see `motion.imu_data`), zeros without any."""
     group = None if imu is None else c.group_or_none(imu, "intrinsics")
     return np.zeros(24) if group is None else group.value
 

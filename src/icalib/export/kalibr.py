@@ -95,13 +95,13 @@ def _imu(c: Calibration, name: str) -> dict[str, Any]:
     T_body_imu, offset = np.eye(4), 0.0
     if name != c.imu:
         T_body_imu = inverse(_T_imu_kalibr(c, c.imu)) @ c.T_imu_sensor(name) @ _T_imu_kalibr(c, name)
-        offset = time_offset(c, name)
+        offset = None if restarts(c, name) else time_offset(c, name)
     data: dict[str, Any] = {
         "T_i_b": inverse(T_body_imu).tolist() if name != c.imu else np.eye(4).tolist(),
         **{theirs: float(noise[ours]) for ours, theirs in KALIBR_NOISE.items()},
         "model": "calibrated",
         "rostopic": f"/{name}",
-        "time_offset": offset,
+        **({} if offset is None else {"time_offset": offset}),
         "update_rate": float(c.rates[name]),
     }
     return data | _intrinsics(c, name)
@@ -146,14 +146,13 @@ def _intrinsics(c: Calibration, imu: str) -> dict[str, Any]:
     x, size = imu_values(c, imu), c.group_or_none(imu, "size_effect")
     if not x.any() and size is None:
         return {}
-    turned = _T_imu_kalibr(c, imu)[:3, :3].T
-    places = () if size is None else (np.zeros(3), size.value[:3], size.value[3:])
-    names = (f"r{axis}_i" for axis in "xyz")
+    C_accel_gyro = _T_imu_kalibr(c, imu)[:3, :3].T
+    places = {} if size is None else {"rx_i": np.zeros(3), "ry_i": size.value[:3], "rz_i": size.value[3:]}
     return {
         "model": "scale-misalignment" if size is None else "scale-misalignment-size-effect",
         "accelerometers": {
             "M": lower(x[:6]).tolist(),
-            **{name: (turned @ r).tolist() for name, r in zip(names, places, strict=False)},
+            **{name: (C_accel_gyro @ r).tolist() for name, r in places.items()},
         },
         "gyroscopes": {
             "M": lower(x[6:12]).tolist(),

@@ -230,8 +230,11 @@ def joined_imu_data(rig: Rig, parts: Sequence[Part], joined: Measurements) -> Im
 
 def further_imu_data(imu: ImuSensor, parts: Sequence[Part], joined: Measurements) -> ImuData:
     """Readings of an IMU after the first, in all `parts` of joined recordings."""
-    streams = [(p, p.measurements.streams[imu.name]) for p in parts]
-    built = [(p, ImuData.build(s, imu.noise, False, imu.sampling)) for p, s in streams if isinstance(s, ImuStream)]
+    built: list[tuple[Part, ImuData]] = []
+    for part in parts:
+        stream = part.measurements.streams[imu.name]
+        assert isinstance(stream, ImuStream)
+        built.append((part, ImuData.build(stream, imu.noise, False, imu.sampling)))
     stream = joined.streams[imu.name]
     assert isinstance(stream, ImuStream)
     return _joined(built, stream)
@@ -295,24 +298,25 @@ def correction_matrices(intrinsics):
 
 
 # Size effect: each axis of an accelerometer is at a place of its own. The IMU frame has its origin at the x axis; the
-# y and z axes are at r_y and r_z [m], so that axis i reads e_i (f + dw/dt x r_i + w x (w x r_i)).
+# y and z axes are at r_y and r_z [m], so that axis i reads e_i^T (f + dw/dt x r_i + w x (w x r_i)), all in the axes of
+# the gyroscope: misalignments of the axes change this by their size, which is neglected.
 
 N_SIZE_EFFECT = 6  # r_y, then r_z
 
 
 def size_effect_matrix(imu: ImuData, gyro_bias: np.ndarray) -> np.ndarray:
-    """(N, 3, 6) derivative of the accelerometer's readings by r_y and r_z [1/s^2]. gyro_bias (3,) rad/s."""
-    w, C = np.ascontiguousarray(imu.gyro - gyro_bias), np.zeros((len(imu.gyro), 3, N_SIZE_EFFECT))
+    """(N, 3, 6) [1/s^2]: derivative of the accelerometer's readings by r_y and r_z. gyro_bias (3,) rad/s."""
+    w, J = np.ascontiguousarray(imu.gyro - gyro_bias), np.zeros((len(imu.gyro), 3, N_SIZE_EFFECT))
     slope = np.gradient(w, imu.seconds, axis=0)
     for begin, end in (*imu.gaps, *imu.seams):  # differences across a gap say nothing
         slope[(imu.seconds >= begin) & (imu.seconds <= end)] = 0.0
     W = so3.hat_many(w)
-    A = so3.hat_many(np.ascontiguousarray(slope)) + W @ W
-    C[:, 1, :3], C[:, 2, 3:] = A[:, 1], A[:, 2]
-    return C
+    lever = so3.hat_many(np.ascontiguousarray(slope)) + W @ W
+    J[:, 1, :3], J[:, 2, 3:] = lever[:, 1], lever[:, 2]
+    return J
 
 
-def at_one_place(imu: ImuData, state: State, gyro_bias: np.ndarray) -> ImuData:
+def without_size_effect(imu: ImuData, state: State, gyro_bias: np.ndarray) -> ImuData:
     """The readings that the accelerometer would have with all axes at the origin, by the size effect in `state`."""
     places = state.values.get((imu.name, "size_effect"))
     if places is None:

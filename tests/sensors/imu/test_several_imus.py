@@ -128,6 +128,21 @@ def test_imus_alone_are_calibrated_to_each_other(recorded, result):
             assert (alone.group(name, key).std < 1.5 * result.group(name, key).std).all()
 
 
+def test_imus_alone_in_two_recordings_with_a_clock_that_restarts():
+    made = scenario(8.0)
+    made = replace(made, cameras=(), sensors=made.sensors[:1])
+    both = [simulate(made, seed=k).measurements for k in (1, 2)]
+    late = both[1].streams["imu1"]
+    both[1] = both[1].with_streams(replace(late, stamps_ns=late.stamps_ns - 10**9))
+    found = calibrate_measurements(rig_for(made).with_("imu1", clock_restarts=True), both)
+    truth = simulate(made, seed=1).truth.values["imu1"]
+    assert found.converged
+    offset = found.group("imu1", "time_offset")
+    assert (np.abs(offset.value - truth["time_offset"] - [0.0, 1.0]) < 3.3 * offset.std).all()
+    arm = found.group("imu1", "translation")
+    assert (np.abs(arm.value - truth["translation"]) < 3.3 * arm.std).all() and arm.std.max() < 1e-3
+
+
 def test_turns_about_one_axis_do_not_show_the_lever_arm_along_it():
     """Gravity shows the rotation about the axis."""
     made = replace(handheld(10.0), cameras=(), motion=HandheldMotion("single_axis"))  # about y of the body
@@ -159,7 +174,7 @@ BAD = {
     "in g": (lambda s, body: {"accel": s.accel / 9.81}, "measures 0.1 times as much; correct accel_unit"),
     "in deg/s": (lambda s, body: {"gyro": np.rad2deg(s.gyro)}, "matches imu0 if it is in deg/s; set gyro_unit"),
     "a copy": (
-        lambda s, body: {"stamps_ns": body.stamps_ns, "gyro": -body.gyro[:, [1, 0, 2]], "accel": body.accel},
+        lambda s, body: {"stamps_ns": body.stamps_ns[1:], "gyro": -body.gyro[1:, [1, 0, 2]], "accel": body.accel[1:]},
         "imu1 and imu0 have the same readings",
     ),
     "of another time": (lambda s, body: {"gyro": s.gyro[::-1].copy(), "accel": s.accel[::-1].copy()}, "does not match"),

@@ -16,7 +16,7 @@ from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
-from icalib.sensors.imu.mounted_factor import USUAL_SPEED_M_S
+from icalib.sensors.imu.mounted_factor import SPEED_SIGMA_M_S
 from icalib.sensors.imu.spec import INTRINSICS_LABELS, prior_words
 from icalib.sensors.imu.stream import ImuResiduals
 
@@ -60,7 +60,7 @@ def notes(inputs: Inputs, timeline: Timeline) -> Iterator[Remark]:
         yield Remark(
             "imus_alone",
             "there are IMUs only: how they move is not measured, and their speed is assumed to be "
-            f"{USUAL_SPEED_M_S:g} m/s (standard deviation of each axis).",
+            f"{SPEED_SIGMA_M_S:g} m/s (standard deviation of each axis).",
         )
     yield from _gaps(inputs, timeline)
 

@@ -1,9 +1,10 @@
 """Initial guess of IMUs that are mounted on another one: from the readings of both alone.
 
-Angular rates give time offset and rotation. Specific forces then give the lever arm p and the difference b of the
-accelerometer biases, by linear least squares: with the body's angular rate w,
+Angular rates give time offset and rotation R. Specific forces then give the lever arm p and the difference b of the
+accelerometer biases, R b_mounted - b_body, by linear least squares. With the body's angular rate w, whose bias is not
+corrected,
 
-    R f_mounted = f_body + dw/dt x p + w x (w x p) + b
+    R f_mounted - f_body = dw/dt x p + w x (w x p) + b
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from icalib.initialize.initializer import (
     MotionSource,
     Values,
     fullest_recording,
+    joined_states,
     known_extrinsics,
     merged_values,
     naming_recording,
@@ -53,10 +55,13 @@ from icalib.sensors.sensor import MOUNTED_NAMES, mounted
 
 STEP_S = 0.02  # s: over which readings are averaged; motion by hand changes more slowly
 ARM_SIGMA_M = 0.5  # m: prior standard deviation of the lever arm about zero
-# Unexplained share of the rates of an IMU that names a cause: noise leaves far less, chance in a few seconds far more.
-MAX_UNEXPLAINED_RATE = 0.05
-# Residual over measured specific force, RMS about the means, above which the accelerometers measured different motions.
-MAX_UNEXPLAINED_FORCE = 0.7
+# A changed unit or axis is named as the cause only below this unexplained share of the rates: noise leaves far less,
+# and chance in a few seconds far more.
+MAX_RATE_RESIDUAL_OF_CAUSE = 0.05
+# Residual over measured specific force, RMS, above which the accelerometers measured different motions.
+MAX_UNEXPLAINED_FORCE = 0.5
+COMPARED_READINGS = 1000  # of two IMUs, to find copies
+MIN_SHARE_OF_COPIES = 0.9  # of the readings; two IMUs have next to none in common
 
 
 class ImuInitializer(Initializer[ImuSensor]):
@@ -84,13 +89,12 @@ class ImuInitializer(Initializer[ImuSensor]):
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         """The rotation by the body's gyroscope, and the position by integrating its accelerometer from rest."""
-        imu = inputs.imu
-        assert imu is not None
         values = start_values(inputs, {})
         keyframes = keyframes_for(inputs, keyframe_times(inputs, values))
-        state = _dead_reckoned(imu, keyframes, inputs.rig.gravity, values)
-        values = start_values(inputs, self.place(inputs, state, inputs.rig.further_imus))
-        return replace(state, values=values)
+        parts = np.split(keyframes, first_keyframes(inputs.imu, keyframes)[1:])
+        states = [_dead_reckoned(single_recording(inputs, k), t - inputs.parts[k].begin) for k, t in enumerate(parts)]
+        state = joined_states(inputs, states, values)
+        return replace(state, values=start_values(inputs, self.place(inputs, state, inputs.rig.further_imus)))
 
     def place(self, inputs: Inputs, state: State, sensors: Sequence[ImuSensor]) -> Values:
         out: Values = {}
@@ -109,9 +113,10 @@ INITIALIZER = ImuInitializer()
 
 def _are_copies(a: ImuStream, b: ImuStream) -> bool:
     """Whether two streams have the same readings, whatever their stamps, and the order and signs of their axes."""
-    n = min(len(a.gyro), len(b.gyro))
-    first, second = (np.sort(np.abs(s.gyro[:n]), axis=1) for s in (a, b))
-    return bool(np.array_equal(first, second) and first.any())
+    first, second = (np.sort(np.abs(s.gyro), axis=1) for s in (a, b))
+    rows = {row.tobytes() for row in second if row.any()}
+    same = [row.tobytes() in rows for row in first[:COMPARED_READINGS]]
+    return bool(np.mean(same) > MIN_SHARE_OF_COPIES)
 
 
 class _ImuPair(NamedTuple):
@@ -127,6 +132,17 @@ def _readings_of(inputs: Inputs, sensor: ImuSensor, recording: int) -> _ImuPair:
     stream = single.stream(sensor.name)
     assert single.imu is not None and isinstance(stream, ImuStream)
     return _ImuPair(single.imu, ImuData.build(stream, sensor.noise, sampling=sensor.sampling))
+
+
+class _SideBySide(NamedTuple):
+    """Means over n successive intervals of `step` s in which both IMUs ran: angular rates and specific forces (n, 3),
+    each in its own axes."""
+
+    step: float
+    rate_body: np.ndarray
+    rate_mounted: np.ndarray
+    force_body: np.ndarray
+    force_mounted: np.ndarray
 
 
 def _aligned_values(inputs: Inputs, sensor: ImuSensor) -> Values:
@@ -152,8 +168,8 @@ def _aligned_values(inputs: Inputs, sensor: ImuSensor) -> Values:
 
 
 def _aligned(pair: _ImuPair, given_offset: float | None) -> RateAlignment:
-    """Time offset, rotation and gyroscope bias of the mounted IMU. About an axis that the motion does not show, the
-    rotation follows from the direction of gravity."""
+    """Time offset, rotation, and difference of the gyroscope biases in the axes of the body. About an axis that the
+    motion does not show, the rotation follows from the direction of gravity."""
     rates = _rates(pair.mounted)
     try:
         alignment = align_rates(pair.body, pair.mounted.name, rates, given_offset)
@@ -161,9 +177,13 @@ def _aligned(pair: _ImuPair, given_offset: float | None) -> RateAlignment:
         raise _explained(pair, rates, given_offset) or error from error
     if turns_about_two_axes(pair.body, rates, alignment):
         return alignment
-    w, v, f, g = _side_by_side(pair, alignment.offset)
-    (w, v), (f, g) = ((a / _rms(a), b / _rms(a)) for a, b in ((w, v), (f, g)))
-    R, _ = kabsch(np.vstack([w, f]), np.vstack([v, g]), np.ones(2 * len(w)))
+    both = _side_by_side(pair, alignment.offset)
+    scales = 1.0 / _rms(both.rate_body), 1.0 / _rms(both.force_body)
+    body = np.vstack([scales[0] * both.rate_body, scales[1] * both.force_body])
+    of_mounted = np.vstack([scales[0] * both.rate_mounted, scales[1] * both.force_mounted])
+    R, _ = kabsch(
+        body, of_mounted, np.ones(len(body))
+    )  # gravity stays, as the means of rates and forces together are removed
     return replace(alignment, rotation=R)
 
 
@@ -181,37 +201,36 @@ def _explained(pair: _ImuPair, rates: SensorRates, given_offset: float | None) -
         with suppress(EstimationError):
             changed = replace(rates, rate=rates.rate * factor)
             alignment = align_rates(pair.body, name, changed, given_offset)
-            if unexplained_share(pair.body, changed, alignment) < MAX_UNEXPLAINED_RATE:
+            if unexplained_share(pair.body, changed, alignment) < MAX_RATE_RESIDUAL_OF_CAUSE:
                 return EstimationError(sentence)
     return None
 
 
+def _step(*imus: ImuData) -> float:
+    """STEP_S, or the duration of two readings of the slowest IMU [s]."""
+    return max(STEP_S, *(2.0 * float(np.median(np.diff(imu.seconds))) for imu in imus))
+
+
 def _rates(imu: ImuData) -> SensorRates:
-    """Mean angular rates over intervals of STEP_S, or of two readings of a slow IMU, outside gaps."""
-    step = max(STEP_S, 2.0 * float(np.median(np.diff(imu.seconds))))
-    edges = np.arange(imu.seconds[0], imu.seconds[-1], step)
+    """Mean angular rates over intervals of `_step`, outside gaps."""
+    edges = np.arange(imu.seconds[0], imu.seconds[-1], _step(imu))
     start, end = edges[:-1], edges[1:]
     inside = imu.covers(start, end)
     start, end = start[inside], end[inside]
     return SensorRates(start, end, MeanRates.of(imu).over(start, end))
 
 
-def _side_by_side(pair: _ImuPair, offset: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mean angular rates of the body's and the mounted IMU, and their mean specific forces, (n, 3) each in its own
-    axes, over successive intervals of STEP_S in which both ran."""
-    step = max(STEP_S, *(2.0 * float(np.median(np.diff(imu.seconds))) for imu in pair))
-    begin, stop = (
-        max(pair.body.seconds[0], pair.mounted.seconds[0] + offset),
-        min(pair.body.seconds[-1], pair.mounted.seconds[-1] + offset),
-    )
-    edges = np.arange(begin, stop, step)
+def _side_by_side(pair: _ImuPair, offset: float) -> _SideBySide:
+    """Means of the readings of both, at the time offset `offset` [s]."""
+    begin = max(pair.body.seconds[0], pair.mounted.seconds[0] + offset)
+    stop = min(pair.body.seconds[-1], pair.mounted.seconds[-1] + offset)
+    edges = np.arange(begin, stop, _step(*pair))
     start, end = edges[:-1], edges[1:]
     inside = pair.body.covers(start, end) & pair.mounted.covers(start - offset, end - offset)
     start, end = start[inside], end[inside]
     spans = (pair.body, start, end), (pair.mounted, start - offset, end - offset)
-    w, v = (MeanRates.of(imu).over(a, b) for imu, a, b in spans)
-    f, g = (_mean_forces(imu, a, b) for imu, a, b in spans)
-    return w, v, f, g
+    rates = (MeanRates.of(imu).over(a, b) for imu, a, b in spans)
+    return _SideBySide(_step(*pair), *rates, *(_mean_forces(imu, a, b) for imu, a, b in spans))
 
 
 def _mean_forces(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -225,30 +244,35 @@ def _mean_forces(imu: ImuData, start: np.ndarray, end: np.ndarray) -> np.ndarray
 def _lever_arm(pair: _ImuPair, name: str, R: np.ndarray, offset: float) -> np.ndarray:
     """p_body_mounted (3,) m by least squares, with a prior about zero. R: R_body_mounted. Raises EstimationError if the
     accelerometers measured different motions."""
-    w, _, f, g = _side_by_side(pair, offset)
-    step = max(STEP_S, *(2.0 * float(np.median(np.diff(imu.seconds))) for imu in pair))
-    slope = np.gradient(w, step, axis=0)  # across a gap it is wrong, and few rows are
-    W = so3.hat_many(np.ascontiguousarray(w))
-    A = np.concatenate([so3.hat_many(np.ascontiguousarray(slope)) + W @ W, np.tile(np.eye(3), (len(w), 1, 1))], axis=2)
-    b = g @ R.T - f
-    about = b - b.mean(axis=0)
-    if _rms(about) > MAX_UNEXPLAINED_FORCE * _rms(f - f.mean(axis=0)) + _force_noise(pair, step):
-        is_other_unit = not 0.5 < _rms(g) / _rms(f) < 2.0
-        raise EstimationError(
-            f"the gyroscopes of {name} and {pair.body.name} match, but their accelerometers do not: that of {name} "
-            f"{f'measures {_rms(g) / _rms(f):.2g} times as much' if is_other_unit else 'has other axes'}; correct "
-            f"{'accel_unit' if is_other_unit else 'accel_axes'} of {name} in the rig file."
-        )
-    A, b = A.reshape(-1, 6), b.ravel()
-    scatter = _rms(about) / np.sqrt(3.0)
+    both = _side_by_side(pair, offset)
+    slope = np.gradient(both.rate_body, both.step, axis=0)  # wrong only in the few rows beside a gap
+    turn = so3.hat_many(np.ascontiguousarray(both.rate_body))
+    by_arm = so3.hat_many(np.ascontiguousarray(slope)) + turn @ turn
+    A = np.concatenate([by_arm, np.tile(np.eye(3), (len(slope), 1, 1))], axis=2).reshape(-1, 6)
+    difference = both.force_mounted @ R.T - both.force_body
+    scatter = _rms(difference - difference.mean(axis=0)) / np.sqrt(3.0)
     prior = scatter / ARM_SIGMA_M * np.eye(3, 6)
-    return np.linalg.lstsq(np.vstack([A, prior]), np.append(b, np.zeros(3)), rcond=None)[0][:3]
+    x = np.linalg.lstsq(np.vstack([A, prior]), np.append(difference.ravel(), np.zeros(3)), rcond=None)[0]
+    residual, force = difference - (A @ x).reshape(-1, 3), both.force_body - both.force_body.mean(axis=0)
+    if _rms(residual) > MAX_UNEXPLAINED_FORCE * _rms(force) + 3.0 * _force_noise(pair, both.step):
+        raise _other_accelerometer(name, pair.body.name, _rms(both.force_mounted) / _rms(both.force_body))
+    return x[:3]
+
+
+def _other_accelerometer(name: str, body: str, size: float) -> EstimationError:
+    """The error of accelerometers that do not match. size: specific force of the mounted IMU over that of the body."""
+    is_other_unit = not 0.5 < size < 2.0
+    return EstimationError(
+        f"the gyroscopes of {name} and {body} match, but their accelerometers do not: that of {name} "
+        f"{f'measures {size:.2g} times as much' if is_other_unit else 'has other axes'}; correct "
+        f"{'accel_unit' if is_other_unit else 'accel_axes'} of {name} in the rig file."
+    )
 
 
 def _force_noise(pair: _ImuPair, step: float) -> float:
-    """Standard deviation [m/s^2] of the length of the difference of two mean specific forces, three times over."""
+    """RMS length [m/s^2] of the noise of the difference of two mean specific forces."""
     density = sum(float(np.median(imu.variance[:, 1])) for imu in pair)
-    return 3.0 * float(np.sqrt(3.0 * density / step))
+    return float(np.sqrt(3.0 * density / step))
 
 
 def _rms(vectors: np.ndarray) -> float:
@@ -256,15 +280,16 @@ def _rms(vectors: np.ndarray) -> float:
     return float(np.sqrt((vectors**2).sum(axis=1).mean()))
 
 
-def _dead_reckoned(imu: ImuData, keyframes: np.ndarray, gravity: float, values: Values) -> State:
-    """The motion from rest at the origin, by the readings alone. The gyroscope turns about zero on average, and the
-    mean specific force in the world points up."""
+def _dead_reckoned(inputs: Inputs, keyframes: np.ndarray) -> State:
+    """The motion in one recording, from rest at the origin, by the readings alone. Assumes zero mean angular rate and a
+    mean specific force that points up. The state has no calibration parameters."""
+    imu = inputs.imu
+    assert imu is not None
     bias = np.concatenate([imu.gyro.mean(axis=0), np.zeros(3)])
-    R_start_imu = GyroRotation.integrate(imu, bias[:3])
-    force = np.einsum("nij,nj->ni", R_start_imu.rotation, imu.accel)
+    gyro_rotation = GyroRotation.integrate(imu, bias[:3])
+    force = np.einsum("nij,nj->ni", gyro_rotation.rotation, imu.accel)
     Q = levelling_rotation(-force.mean(axis=0))
-    acceleration = SignalIntegrals.of(imu, force @ Q.T - np.array([0.0, 0.0, gravity]))
+    acceleration = SignalIntegrals.of(imu, force @ Q.T - np.array([0.0, 0.0, inputs.rig.gravity]))
     velocity, position = acceleration.at(keyframes)
-    rotation = Q @ R_start_imu.at(keyframes)
-    starts = first_keyframes(imu, keyframes)
-    return State(keyframes, rotation, position, velocity, np.tile(bias, (len(keyframes), 1)), values, starts)
+    rotation = Q @ gyro_rotation.at(keyframes)
+    return State(keyframes, rotation, position, velocity, np.tile(bias, (len(keyframes), 1)), {})

@@ -1,23 +1,24 @@
 """The factor of an IMU that is mounted on another one: its readings between its own poses at the keyframes.
 
-Its rotation and position follow from those of the first IMU, the body, by extrinsics and time offset (`SensorPose`).
-Its velocity is a state of its own, u = R_world_body^T (v - v_body), and so are its biases. The velocity could also be
-had from the body's angular rate and the lever arm, but a rate at an instant is known only as a noisy reading, and that
-noise would be the same in two intervals. With a free velocity the readings of each IMU enter once, in its own factor,
-and it does not matter which IMU is the body.
+Its rotation and position follow from those of the body, the first IMU, by extrinsics and time offset (`SensorPose`).
+Its velocity is a state of its own, u = R_world_body^T (v - v_body), and so are its biases.
+
+The body's angular rate and the lever arm also give the velocity. But a rate at one instant is a single noisy reading,
+and two intervals would share its noise. With a free velocity the readings of each IMU enter once, in its own factor,
+and it does not matter which IMU is the body. The lever arm shows in the rows of the position. A change of the time
+offset within a pass moves the poses, but not the velocity, which is free.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
-from icalib.motion.imu_data import ImuData, at_one_place, clear_of
+from icalib.motion.imu_data import ImuData, clear_of, without_size_effect
 from icalib.motion.poses import EstimatedMotion, gravity_of, offset_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, add_pose_chain
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece
@@ -35,12 +36,12 @@ from icalib.sensors.imu.residual import (
     fill_residual,
     free_columns,
     free_values,
-    preintegrated_by_all,
+    preintegrated_with_jacobians,
     state_change,
 )
 
-# Information [SI] on velocity and biases at each keyframe: keeps them defined where there are no readings, and is too
-# weak for other effects, at standard deviations of 1 km/s, 1000 rad/s and 1000 m/s^2.
+# Information [SI] on steps of velocity and biases at each keyframe: keeps them defined where there are no readings. Its
+# standard deviations of 1 km/s, 1000 rad/s and 1000 m/s^2 are too wide for other effects.
 WEAK_INFORMATION = 1e-6
 
 
@@ -67,9 +68,10 @@ def _linearise(first, last, chain, increments, dx, n_gravity, r, J):
 class MountedImuFactor(RowFactor):
     """All intervals of one mounted IMU between neighbouring keyframes; the rows are those of `ImuFactor`.
 
-    readings: of the mounted IMU. imu, gravity: readings of the body's IMU, and gravity [m/s^2] where the state has
-    none. seconds (K,): keyframes on its clock when the factor was built. increments: W is zero where it has no
-    readings, but for the biases. state_column: of its velocity and biases in a keyframe.
+    readings: of the mounted IMU, corrected for its size effect. imu, gravity: readings of the body, and gravity [m/s^2]
+    where the state has none. seconds (K,): keyframes on its clock when the factor was built. increments: W is zero
+    where it has no readings, but for the biases. values0: free parameters then. state_column: of its velocity and
+    biases in a keyframe.
     """
 
     readings: ImuData
@@ -87,12 +89,12 @@ class MountedImuFactor(RowFactor):
         state, name = motion.state, readings.name
         n = len(state.seconds)
         seconds = state.seconds - offset_at(state, name, np.arange(n))
-        intrinsics, bias = state.values[name, "intrinsics"], _own_states(layout, state, name)[:, 3:]
+        intrinsics, bias = state.values[name, "intrinsics"], _imu_states(layout, state, name)[:, 3:]
         usable = readings.covers(seconds[:-1], seconds[1:]) & clear_of(readings.seams, seconds[:-1], seconds[1:])
         usable[np.array(state.starts[1:], dtype=np.int64) - 1] = False
         n_columns = len(free_columns(layout, name))
-        readings = at_one_place(readings, state, bias[:, :3].mean(axis=0))
-        increments = preintegrated_by_all(readings, seconds, usable, bias, intrinsics, n_columns)
+        readings = without_size_effect(readings, state, bias[:, :3].mean(axis=0))
+        increments = preintegrated_with_jacobians(readings, seconds, usable, bias, intrinsics, n_columns)
         R = state.rotation @ state.values[name, "rotation"]
         # Zero residual without readings: Log of an arbitrary rotation may have no derivative.
         increments.dR[~usable] = (R[:-1].transpose(0, 2, 1) @ R[1:])[~usable]
@@ -132,17 +134,13 @@ class MountedImuFactor(RowFactor):
         return Whitened.empty(len(self.seconds) - 1, N_ROWS)
 
     def count(self, out: Whitened, kind: str) -> int:
-        """See `RowFactor`; intervals without readings do not count."""
-        ran = self.increments.W[:, 0, 0] > 0.0
-        return int(ran.sum()) * out.residual[:, self.kinds[kind]].shape[1]
+        """See `RowFactor`; without readings, an interval counts for the bias walk only."""
+        columns = self.kinds[kind]
+        return int((self.increments.W[:, columns.start, columns.start] > 0.0).sum()) * (columns.stop - columns.start)
 
     def times(self, state: State) -> np.ndarray:
         """(K - 1,) time [s] of the keyframe at which each interval starts."""
         return state.seconds[:-1]
-
-    def cut(self, state: State, keyframes: tuple[int, ...]) -> Self:
-        """See `Factor`: an interval lies between two keyframes already."""
-        return self
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
@@ -169,7 +167,7 @@ class MountedImuFactor(RowFactor):
 
     def _chain(self, state: State, keyframes: np.ndarray, at: SensorPose) -> Chain:
         """The IMU's own states at the keyframes `keyframes`, in arrays (K, ...) of which only these are filled."""
-        n, states = len(self.seconds), _own_states(self.layout, state, self.name)
+        n, states = len(self.seconds), _imu_states(self.layout, state, self.name)
         R, p, v = np.zeros((n, 3, 3)), np.zeros((n, 3)), np.zeros((n, 3))
         R[keyframes], p[keyframes] = at.rotation, at.position
         v[keyframes] = state.velocity[keyframes] + np.einsum(
@@ -180,44 +178,44 @@ class MountedImuFactor(RowFactor):
 
     def _rows(self, state: State, chain: Chain, at: SensorPose, some: tuple[slice, int], jacobians: bool) -> Rows:
         """Rows of the intervals some[0]; some[1]: keyframe of the first pose in `at`."""
-        (k, first), n_own, gravity = some, len(self.values0), self._gravity_column
+        (k, first), n_free, gravity = some, len(self.values0), self._gravity_column
         m = k.stop - k.start
         r = np.empty((m, N_ROWS))
-        J_own = np.zeros((m if jacobians else 0, N_ROWS, 2 * KEYFRAME_DIM + n_own + len(gravity)))
-        dx = free_values(state, self.name, n_own) - self.values0
-        _linearise(k.start, k.stop, chain, self.increments, dx, len(gravity), r, J_own)
+        J_imu = np.zeros((m if jacobians else 0, N_ROWS, 2 * KEYFRAME_DIM + n_free + len(gravity)))
+        dx = free_values(state, self.name, n_free) - self.values0
+        _linearise(k.start, k.stop, chain, self.increments, dx, len(gravity), r, J_imu)
         dim, n_pose = self.layout.keyframe_dim, at.n_calib
-        J = np.zeros((len(J_own), N_ROWS, 2 * dim + n_pose + n_own + len(gravity)))
+        J = np.zeros((len(J_imu), N_ROWS, 2 * dim + n_pose + n_free + len(gravity)))
         if jacobians:
-            J[:, :, 2 * dim + n_pose :] = J_own[:, :, 2 * KEYFRAME_DIM :]
+            J[:, :, 2 * dim + n_pose :] = J_imu[:, :, 2 * KEYFRAME_DIM :]
             for end in range(2):
                 keyframes = slice(k.start + end, k.stop + end)
-                by_state = J_own[:, :, KEYFRAME_DIM * end : KEYFRAME_DIM * (end + 1)]
+                J_state = J_imu[:, :, KEYFRAME_DIM * end : KEYFRAME_DIM * (end + 1)]
                 self._add_end(
-                    state, keyframes, by_state, at.part(slice(keyframes.start - first, keyframes.stop - first)), end, J
+                    state, keyframes, J_state, at.part(slice(keyframes.start - first, keyframes.stop - first)), end, J
                 )
         return Rows(r, J)
 
     def _add_end(
-        self, state: State, keyframes: slice, by_state: np.ndarray, at: SensorPose, end: int, J: np.ndarray
+        self, state: State, keyframes: slice, J_state: np.ndarray, at: SensorPose, end: int, J: np.ndarray
     ) -> None:
-        """Adds to J the derivatives by one end of the intervals. by_state (m, 15, 15): by the IMU's own state there."""
+        """Adds to J the derivatives by one end of the intervals. J_state (m, 15, 15): by the IMU's own state there."""
         dim = self.layout.keyframe_dim
-        by_pose = np.concatenate([by_state[:, :, :3], by_state[:, :, 3:6] @ at.rotation], axis=2)
-        add_pose_chain(by_pose, at, dim * end, 2 * dim, J)
+        J_pose = np.concatenate([J_state[:, :, :3], J_state[:, :, 3:6] @ at.rotation], axis=2)
+        add_pose_chain(J_pose, at, dim * end, 2 * dim, J)
         first, R = dim * end + self.state_column, np.ascontiguousarray(state.rotation[keyframes])
-        u = np.ascontiguousarray(_own_states(self.layout, state, self.name)[keyframes, :3])
-        by_velocity = by_state[:, :, 6:9] @ R
-        J[:, :, first : first + 3] += by_velocity
-        J[:, :, first + 3 : first + FURTHER_IMU_DIM] += by_state[:, :, 9:]
-        J[:, :, dim * end + 6 : dim * end + 9] += by_state[:, :, 6:9]
-        J[:, :, dim * end : dim * end + 3] -= by_velocity @ so3.hat_many(u)
+        u = np.ascontiguousarray(_imu_states(self.layout, state, self.name)[keyframes, :3])
+        J_velocity = J_state[:, :, 6:9] @ R
+        J[:, :, first : first + 3] += J_velocity
+        J[:, :, first + 3 : first + FURTHER_IMU_DIM] += J_state[:, :, 9:]
+        J[:, :, dim * end + 6 : dim * end + 9] += J_state[:, :, 6:9]
+        J[:, :, dim * end : dim * end + 3] -= J_velocity @ so3.hat_many(u)
 
     def _accumulate_priors(self, state: State, piece: Piece, sums: bool) -> float:
         """Adds the broad prior on the biases at the first keyframe of each recording in `piece`, with the biases at the
         start of the pass as its mean, and WEAK_INFORMATION at each keyframe. Returns half the chi^2 of the biases."""
         cost, o = 0.0, self.state_column
-        bias = _own_states(self.layout, state, self.name)[:, 3:]
+        bias = _imu_states(self.layout, state, self.name)[:, 3:]
         if sums:
             columns = range(o, o + FURTHER_IMU_DIM)
             piece.diagonal[:, columns, columns] += WEAK_INFORMATION
@@ -233,14 +231,15 @@ class MountedImuFactor(RowFactor):
         return cost
 
 
-# Speed of whatever carries IMUs without any other sensor, RMS: it keeps gravity and gyroscope biases determined.
-USUAL_SPEED_M_S = 10.0
+# m/s, on each axis: standard deviation of the velocity of IMUs without any other sensor, as they are carried or driven.
+# It keeps gravity and gyroscope biases determined.
+SPEED_SIGMA_M_S = 10.0
 
 
 @dataclass(frozen=True)
 class SlowMotion(RowFactor):
-    """Prior on the velocity at each keyframe, zero with the standard deviation USUAL_SPEED_M_S: IMUs alone do not show
-    how fast they move. starts: first keyframe of each recording."""
+    """Gaussian prior on the velocity at each keyframe, of mean 0 and standard deviation SPEED_SIGMA_M_S: IMUs alone do
+    not measure it. starts: first keyframe of each recording."""
 
     name: str
     n_keyframes: int
@@ -252,7 +251,7 @@ class SlowMotion(RowFactor):
 
     @property
     def kinds(self) -> dict[str, slice]:
-        """Empty: an assumption has no residuals."""
+        """Empty: a prior is not reported as residuals."""
         return {}
 
     def with_imu(self, imu: ImuData, state: State) -> SlowMotion:
@@ -271,7 +270,7 @@ class SlowMotion(RowFactor):
             rows.residual[:] = state.velocity[some]
             rows.J_keyframe[:, :, 6:9] = np.eye(3)
             at = rows.on_intervals(keyframe[some], self.n_keyframes)
-            noise = RobustNoise(np.tile(np.eye(3) / USUAL_SPEED_M_S, (len(at), 1, 1)), "none", 1.0)
+            noise = RobustNoise(np.tile(np.eye(3) / SPEED_SIGMA_M_S, (len(at), 1, 1)), "none", 1.0)
             cost += add_rows(rows, some, at, none, noise, Into(piece, out, sums, curved))
         return cost
 
@@ -281,7 +280,7 @@ def _state_column(layout: Layout, name: str) -> int:
     return KEYFRAME_DIM + FURTHER_IMU_DIM * layout.further_imus.index(name)
 
 
-def _own_states(layout: Layout, state: State, name: str) -> np.ndarray:
+def _imu_states(layout: Layout, state: State, name: str) -> np.ndarray:
     """(K, 9) relative velocity [m/s] and biases of IMU `name`."""
     o = _state_column(layout, name) - KEYFRAME_DIM
     return state.further_imus[:, o : o + FURTHER_IMU_DIM]

@@ -59,8 +59,9 @@ class Chain(NamedTuple):
 class Increments(NamedTuple):
     """K - 1 preintegrated intervals, in the axes of their first keyframe.
 
-    dR (K - 1, 3, 3), dv [m/s], dp [m] (K - 1, 3), at the biases bias0 (K, 6); J (K - 1, 9, 6 or 30): their Jacobians by
-    biases and intrinsics; W (K - 1, 15, 15): inverse Cholesky factor of the covariance, which whitens the rows.
+    dR (K - 1, 3, 3), dv [m/s], dp [m] (K - 1, 3), at the biases bias0 (K, 6); J (K - 1, 9, 6 + p): their Jacobians by
+    biases and p free parameters, see `GROUPS`; W (K - 1, 15, 15): inverse Cholesky factor of the covariance, which
+    whitens the rows.
     """
 
     dR: np.ndarray
@@ -108,20 +109,20 @@ def free_values(state: State, imu: str, n_columns: int) -> np.ndarray:
     return np.concatenate([np.zeros(0), *(state.values[imu, group] for group in GROUPS[n_columns])])
 
 
-def preintegrated_by_all(
+def preintegrated_with_jacobians(
     imu: ImuData, seconds: np.ndarray, usable: np.ndarray, bias: np.ndarray, intrinsics: np.ndarray, n_columns: int
 ) -> Increments:
     """As `preintegrated`, with Jacobians by all free parameters, see `GROUPS`. The size effect changes the readings of
-    the accelerometer, in which increments of velocity and position are linear."""
+    the accelerometer, in which increments are linear; with g-sensitivity, to first order."""
     groups = GROUPS[n_columns]
     n_intrinsics = N_INTRINSICS if "intrinsics" in groups else 0
     made = preintegrated(imu, seconds, usable, bias, intrinsics, n_intrinsics)
     if "size_effect" not in groups:
         return made
-    by_reading = size_effect_matrix(imu, bias[:, :3].mean(axis=0))
+    J_reading = size_effect_matrix(imu, bias[:, :3].mean(axis=0))
     J = np.concatenate([made.J, np.zeros((len(made.J), 9, N_SIZE_EFFECT))], axis=2)
     for k in range(N_SIZE_EFFECT):
-        step = replace(imu, accel=np.ascontiguousarray(imu.accel - SIZE_EFFECT_STEP_M * by_reading[:, :, k]))
+        step = replace(imu, accel=np.ascontiguousarray(imu.accel - SIZE_EFFECT_STEP_M * J_reading[:, :, k]))
         moved = preintegrated(step, seconds, usable, bias, intrinsics, 0)
         turned = so3.log_many(np.ascontiguousarray(made.dR.transpose(0, 2, 1) @ moved.dR))
         change = np.concatenate([turned, moved.dv - made.dv, moved.dp - made.dp], axis=1)
@@ -132,7 +133,7 @@ def preintegrated_by_all(
 @njit(cache=True, nogil=True, inline="always")
 def bias_correction(k, chain, increments, dx, change):
     """Fills change (9,), the first-order change of the increment of interval k since preintegration, from the changes
-    of the biases and of the intrinsics dx (24 or 0,)."""
+    of the biases and of the free parameters dx (p,)."""
     for i in range(9):
         change[i] = 0.0
         for j in range(6):
@@ -172,7 +173,7 @@ def fill_residual(k, chain, increments, change, R01, hv, hp, r):
 
 @njit(cache=True, nogil=True, inline="always")
 def fill_jacobians(k, chain, increments, change, R01, hv, hp, r, J):
-    """Fills J (15, 30 + 24 or 0, and more) of r by keyframe k, keyframe k + 1 and intrinsics. The caller has set the
+    """Fills J (15, 30 + p, and more) of r by keyframe k, keyframe k + 1 and free parameters. The caller has set the
     constant entries, zeros and the 1 and -1 of the biases."""
     Jr_inv, R0 = so3.right_jacobian_inverse(r[:3]), chain.R[k]
     J_first, J_v, J_p = mul3(Jr_inv, tmul3(chain.R[k + 1], R0)), so3.hat(hv), so3.hat(hp)
@@ -203,9 +204,9 @@ def fill_last_column(k, chain, unit, r, J):
     none."""
     dt, last = chain.seconds[k + 1] - chain.seconds[k], J.shape[1] - 1
     for i in range(3):
-        down = chain.R[k, 2, i]
+        up = chain.R[k, 2, i]
         if chain.gravity > 0.0:
-            J[3 + i, last], J[6 + i, last] = down * dt, 0.5 * down * dt * dt
+            J[3 + i, last], J[6 + i, last] = up * dt, 0.5 * up * dt * dt
         else:
             J[3 + i, last], J[6 + i, last], J[12 + i, last] = -r[3 + i] / unit, -r[6 + i] / unit, -r[12 + i] / unit
 
@@ -214,8 +215,8 @@ def fill_last_column(k, chain, unit, r, J):
 def _accumulate(k1, chain, increments, dx, unit, columns, sums, out):
     """Adds intervals `sums.first` to k1 - 1 to the normal equations, and fills whitened residuals out (K - 1, 15).
 
-    dx (24 or 0,): changes of the intrinsics since preintegration. unit: see `ImuData`. columns: calibration columns of
-    the intrinsics, then of the unit or of gravity. Returns half the chi^2. Without sums (empty arrays) only the
+    dx (p,): changes of the free parameters since preintegration. unit: see `ImuData`. columns: their calibration
+    columns, then that of the unit or of gravity. Returns half the chi^2. Without sums (empty arrays) only the
     residuals are filled.
     """
     width, W = KEYFRAME_PAIR_DIM + len(columns), np.zeros((N_ROWS, N_ROWS))
@@ -311,7 +312,7 @@ class ImuFactor(RowFactor):
         seams = np.array(state.starts[1:], dtype=np.int64) - 1
         n_columns = len(columns) - (imu.unit is not None)
         usable = ~np.isin(np.arange(len(state.seconds) - 1), seams)
-        increments = preintegrated_by_all(imu, state.seconds, usable, bias0, intrinsics, n_columns)
+        increments = preintegrated_with_jacobians(imu, state.seconds, usable, bias0, intrinsics, n_columns)
         # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
         increments.dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
         values = free_values(state, imu.name, n_columns)

@@ -32,15 +32,15 @@ from icalib.tools.simulation.scenario import (
 )
 from icalib.tools.simulation.trajectory import LEAD_S, TrueTrajectory, stamped
 
-_STEP_S = 2e-3  # of the central differences of positions; at fourth order, motion of 5 Hz leaves 1e-9 m/s^2
+_STEP_S = 2e-3  # of central differences of fourth order: they miss 2e-7 of an acceleration of 5 Hz
 _HEADER = "t [ns],wx [rad/s],wy [rad/s],wz [rad/s],ax [m/s^2],ay [m/s^2],az [m/s^2]"
 
 
 @dataclass(frozen=True, eq=False)
 class SimImu(SimSensor):
-    """An IMU at T_imu_sensor on the first one, with noise, biases at the first reading [rad/s, m/s^2] and intrinsics
-    (24,) of its own, see `Scenario`. size_effect (6,) [m]: places of the accelerometer's y and z axes relative to that
-    of x. Readings inside `gaps` are lost."""
+    """An IMU at T_imu_sensor on the first one. Its noise, biases at the first reading [rad/s, m/s^2] and intrinsics
+    (24,) are as in `Scenario`. size_effect (6,) [m]: places of the accelerometer's y and z axes relative to that of x,
+    in the axes of its gyroscope. Readings inside `gaps` are lost."""
 
     sensor_type: ClassVar[str] = "imu"
     random_stream: ClassVar[int] = 6000
@@ -72,7 +72,7 @@ class SimImu(SimSensor):
         return TrueParameters(values | ({"size_effect": np.array(self.size_effect)} if any(self.size_effect) else {}))
 
     def report(self, scene: SimScene, seed: list[int], progress: Callable[[float], None]) -> Report:
-        """Readings at instants within those of the first IMU; the truth is that without noise, biases included."""
+        """Readings at instants within those of the first IMU; the truth is these readings with their biases."""
         stamps, seconds = stamped(self, scene.imu_seconds[-1] - LEAD_S)
         kept = np.all([(seconds < a) | (seconds > b) for a, b in self.gaps], axis=0) if self.gaps else slice(None)
         stamps, seconds = stamps[kept], seconds[kept]

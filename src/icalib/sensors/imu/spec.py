@@ -47,7 +47,7 @@ class ImuNoise:
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Standard deviations of the parameters of the scale-misalignment model (`motion.imu_model`) about the ideal
+    """Standard deviations of the parameters of the scale-misalignment model (`motion.imu_data`) about the ideal
     IMU. Scales are relative; misalignments of an axis and the rotation between gyroscope and accelerometer are in
     rad; g-sensitivity is in rad/s per m/s^2."""
 
@@ -164,7 +164,7 @@ class ImuSensor(MountedSensor):
     Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
     sampling: `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
     assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
-    `motion.imu_model`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
+    `motion.imu_data`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
     prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU. size_effect (6,): places
     [m] of the accelerometer's y and z axes relative to that of x; fixed without a value: all at one place.
     """
