@@ -15,7 +15,7 @@ from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.saving import load_calibration
-from icalib.rig import Parameter
+from icalib.rig import ImuSensor, Parameter
 from icalib.rig.file import lack_of, rig_from_dict, rig_to_dict
 from icalib.sensors.imu.simulate import SimImu
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate
@@ -33,9 +33,13 @@ def pose(turn, place):
 def scenario(seconds=6.0, noiseless=False) -> Scenario:
     """A camera in front of a board, and two more IMUs with clocks and rates of their own."""
     made = handheld(seconds, noiseless=noiseless)
-    clock = {"clock_origin_ns": made.imu_clock_origin_ns}
-    first = SimImu("imu1", pose([0.5, -1.2, 0.8], [0.12, -0.08, 0.05]), 0.0123, 2000.0 if noiseless else 333.0, **clock)
-    second = SimImu("imu2", pose([-0.9, 0.4, 2.0], [-0.2, 0.1, 0.15]), -0.0051, 2000.0 if noiseless else 500.0, **clock)
+    clock, fast = made.imu_clock_origin_ns, 2000.0
+    first = SimImu(
+        "imu1", pose([0.5, -1.2, 0.8], [0.12, -0.08, 0.05]), 0.0123, fast if noiseless else 333.0, clock_origin_ns=clock
+    )
+    second = SimImu(
+        "imu2", pose([-0.9, 0.4, 2.0], [-0.2, 0.1, 0.15]), -0.0051, fast if noiseless else 500.0, clock_origin_ns=clock
+    )
     camera = replace(made.cameras[0], rate_hz=10.0)
     return replace(made, cameras=(camera,), robot_noise_enabled=not noiseless).with_sensors(first, second)
 
@@ -202,7 +206,7 @@ def test_the_rig_file_keeps_all_imus(recorded):
     rig = replace(rig_for(recorded.scenario), body="imu2")
     again = rig_from_dict(rig_to_dict(rig), "rig.yaml")
     assert rig_to_dict(again) == rig_to_dict(rig) and again.imu is not None and again.imu.name == "imu2"
-    assert [(s.name, s.mounted) for s in again.sensors.values() if s.is_inertial] == [
+    assert [(s.name, s.mounted) for s in again.of(ImuSensor)] == [
         ("imu2", False), ("imu0", True), ("imu1", True),
     ]  # fmt: skip
     with pytest.raises(RigError, match="imu2 is the body"):

@@ -85,7 +85,7 @@ def preintegrated(
     edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(int)))
     runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist()]
     halves = [(a, b) for begin, end in runs for a, b in ((begin, (begin + end) // 2), ((begin + end) // 2, end))]
-    in_parallel(lambda k: _preintegrate(*k, seconds, first, readings, bias, intrinsics, *arrays), halves)
+    in_parallel(lambda k: _preintegrate(k[0], k[1], seconds, first, readings, bias, intrinsics, *arrays), halves)
     return Increments(*arrays, bias)
 
 

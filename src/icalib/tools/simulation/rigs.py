@@ -115,7 +115,9 @@ def _treated(
     """The sensor with each parameter group treated as in `rig_for`; true: values by name."""
     groups = {spec.name for spec in sensor.stated()} & true.keys()
     prefix = "imu_" if sensor.is_inertial else ""  # the intrinsics of an IMU are other parameters than those of cameras
-    named = {name: treatments.get(prefix * (name == "intrinsics") + name, others) for name in groups}
+    named: dict[str, Treatment] = {
+        name: treatments.get(prefix * (name == "intrinsics") + name, others) for name in groups
+    }
     return replace(sensor, **{name: _parameter(treatment, true[name]) for name, treatment in named.items()})
 
 
