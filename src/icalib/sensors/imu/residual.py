@@ -78,9 +78,8 @@ def preintegrated(
     """The intervals between `seconds` (K,) on the IMU's clock, preintegrated at the biases (K, 6) and `intrinsics`
     (24,), with Jacobians by n_intrinsics of these. Those that are not `usable` (K - 1,) have W = 0, and no motion."""
     n = len(seconds) - 1
-    identity = np.tile(np.eye(3), (n, 1, 1))
-    sizes = (n, 9, 6 + n_intrinsics), (n, N_ROWS, N_ROWS)
-    arrays = identity, np.zeros((n, 3)), np.zeros((n, 3)), *(memory.mmap_zeros(size) for size in sizes)
+    J, W = memory.mmap_zeros((n, 9, 6 + n_intrinsics)), memory.mmap_zeros((n, N_ROWS, N_ROWS))
+    arrays = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.zeros((n, 3)), J, W
     first, readings = imu.interval(seconds[:-1]), readings_of(imu)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(int)))
     runs = [(a, b) for a, b in edges.reshape(-1, 2).tolist()]
