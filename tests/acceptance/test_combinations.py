@@ -43,11 +43,9 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
     """A part of the sentence that refuses a combination; empty where it is calibrated."""
     if not sees and others == "wheels":
         return "there is no camera, no LiDAR, no pose sensor and no position sensor"
-    if not imu and "lidar" in others:
-        return "lidar0 needs an IMU"
-    if not imu and not sees and others == "pose":
-        return "mocap0 is the only sensor"
-    if not imu and sees == "tracks" and "pose" not in others:
+    if not imu and not sees and others in ("lidar", "pose"):
+        return "is the only sensor"
+    if not imu and sees == "tracks" and not {"lidar", "pose"} & set(others.split("+")):
         return "determines the scale"
     return ""
 
@@ -132,8 +130,8 @@ def rig_and_measurements(
 
 
 def in_body(rig: Rig, simulation: Simulation) -> Rig:
-    """The rig without an IMU, whose guesses are in the frame and on the clock of its first camera or pose sensor."""
-    if not rig.cameras and not rig.poses:
+    """The rig without an IMU, whose guesses are in the frame and on the clock of its body."""
+    if not rig.cameras and not rig.poses and not rig.lidars:
         return rig
     T0, offset0 = body(rig, simulation)
 
@@ -146,7 +144,7 @@ def in_body(rig: Rig, simulation: Simulation) -> Rig:
         values = zip(EXTRINSICS, (R, p, sensor.time_offset.value - offset0), strict=True)
         return replace(sensor, **{name: Parameter("free", value) for name, value in values})
 
-    kinds = ("cameras", "wheels", "poses")
+    kinds = ("cameras", "lidars", "wheels", "poses")
     return rig.with_(**{kind: tuple(moved(s) for s in getattr(rig, kind)) for kind in kinds})
 
 

@@ -20,6 +20,7 @@ GNSS = PositionSensor("gnss0", "")
 IMU = ImuSensor("imu0", "", ImuNoise(1e-4, 1e-5, 1e-3, 1e-4))
 LIDAR, WHEELS = Lidar("lidar0", ""), Wheels("wheel0", "", "differential")
 MOCAP, ODOMETRY = PoseSensor("mocap0", ""), PoseSensor("odom0", "", "relative")
+FOLLOWER = Camera("cam0", "", "eucm", (9, 9), tracks="images")
 EMPTY = Measurements.of_streams()
 
 
@@ -32,19 +33,15 @@ EMPTY = Measurements.of_streams()
             "wheel0 and imu0 do not determine the motion, and there is no camera",
         ),
         (Rig(by_name(WHEELS)), "there is no camera, no LiDAR, no pose sensor and no position sensor"),
-        (Rig(by_name(LIDAR)), "lidar0 needs an IMU"),
-        (Rig(by_name(LIDAR, MOCAP)), "lidar0 needs an IMU"),
-        (Rig(by_name(LIDAR, WHEELS)), "lidar0 needs an IMU"),
+        (Rig(by_name(LIDAR)), "lidar0 is the only sensor"),
         (Rig(by_name(MOCAP)), "mocap0 is the only sensor"),
         (Rig(by_name(GNSS)), "gnss0 positions do not determine rotations; add an IMU, a camera that sees a target"),
         (
             Rig(by_name(GNSS, WHEELS)),
             "gnss0 positions and wheel0 do not determine roll and pitch; if the floor",
         ),
-        (Rig(by_name(GNSS, WHEELS, LIDAR)), "lidar0 needs an IMU"),
-        (Rig(by_name(GNSS, LIDAR)), "lidar0 needs an IMU"),
-        (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
-        (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, or a camera that sees a target"),
+        (Rig(by_name(GNSS, ODOMETRY)), "odom0 without an IMU, a LiDAR, or a camera that sees a target"),
+        (Rig(by_name(WHEELS, ODOMETRY)), "odom0 without an IMU, a LiDAR, or a camera that sees a target"),
     ],
 )
 def test_what_cannot_be_calibrated_is_refused(rig: Rig, sentence: str):
@@ -77,6 +74,20 @@ def test_a_camera_that_sees_a_target_stands_in_for_absolute_poses():
 def test_rigs_made_in_python_are_checked_as_rig_files_are(rig: Rig, words: str):
     with pytest.raises(RigError, match=words):
         check_complete(rig)
+
+
+@each(
+    ("rig", "body"),
+    [
+        (Rig(by_name(LIDAR, MOCAP)), "lidar0"),
+        (Rig(by_name(LIDAR, ODOMETRY)), "lidar0"),
+        (Rig(by_name(WHEELS, GNSS, LIDAR)), "lidar0"),
+        (Rig(by_name(LIDAR, FOLLOWER)), "lidar0"),
+        (Rig(by_name(LIDAR, FOLLOWER), Checkerboard(6, 7, 0.1)), "cam0"),
+    ],
+)
+def test_a_lidar_is_the_body_unless_a_camera_sees_a_target(rig: Rig, body: str):
+    assert lack_of(rig) is None and rig.reference == body
 
 
 @each(

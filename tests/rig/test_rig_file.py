@@ -434,8 +434,6 @@ def test_imus_without_a_camera(tmp_path):
     assert "there is no camera, no LiDAR, no pose sensor and no position sensor" in complaint(
         tmp_path, "sensors:\n" + imu + wheels + rest
     )
-    lidar = "  lidar0: {type: lidar}\n"
-    assert "sensors.lidar0: needs an IMU" in complaint(tmp_path, "sensors:\n" + camera + wheels + lidar + rest)
     placed = "  imu0: {type: imu, time_offset: {fixed: 0}}\n"
     second = complaint(tmp_path, "sensors:\n" + placed + "  imu1: {type: imu}\n" + camera + rest)
     assert "rig.yaml:2: sensors.imu0.time_offset: imu0 is the body" in second

@@ -110,13 +110,14 @@ class Measurements:
         return self.reference.origin_ns if self.imu is None else self.imu.origin_ns
 
     @property
-    def reference(self) -> CornerStream | TrackStream | PoseStream | WheelStream | WheelPoses:
-        """Stream of the reference sensor if there is no IMU: the first camera, else pose sensor, else wheels.
+    def reference(self) -> CornerStream | TrackStream | LidarStream | PoseStream | WheelStream | WheelPoses:
+        """Stream of the reference sensor if there is no IMU: the first camera, else LiDAR, pose sensor, or wheels.
 
-        If the cameras have only feature tracks, it is the first pose sensor, or else the first camera.
+        If the cameras have only feature tracks, it is the first LiDAR or pose sensor, or else the first camera.
         """
+        alone = (*self.lidars, *self.poses)
         follow = bool(self.tracks) and not any(len(c.uv) for c in self.cameras)
-        return (*self.poses, *self.tracks)[0] if follow else (*self.cameras, *self.poses, *self.wheels)[0]
+        return (*alone, *self.tracks)[0] if follow else (*self.cameras, *alone, *self.wheels)[0]
 
     @property
     def has_clock(self) -> bool:

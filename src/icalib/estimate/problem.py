@@ -294,7 +294,7 @@ def keyframe_times(inputs: Inputs, values: Mapping[Key, np.ndarray]) -> dict[str
     """Times at which keyframes are wanted, by sensor [s, body's clock since its first stamp]: those of the first kind
     that places any. If the rig assumes its motion and poses measure it, those of all kinds."""
     rig, times = inputs.rig, dict[str, np.ndarray]()
-    every_kind = rig.assumes_motion and rig.moves_by_poses
+    every_kind = rig.assumes_motion and (rig.moves_by_poses or any(s.shows_planes for s in rig.mounted))
     for model, sensors in by_kind(rig.mounted):
         if every_kind or not times:
             times |= model.keyframe_times(sensors, rig, inputs.measurements.streams, values)

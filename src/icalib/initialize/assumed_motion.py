@@ -115,7 +115,11 @@ def _guess(rig: Rig, recordings: Sequence[Measurements], trajectory: BodyTraject
     # The biases are minus the rate and acceleration of the body, because the assumed IMU reads zero.
     unplaced = [s for s in rig_with_imu.mounted if (s.name, "rotation") not in start.values]
     values = place_sensors(ideal, start, unplaced) | start.values
-    return inputs, replace(start, bias=-rates, values=values), values
+    state = replace(start, bias=-rates, values=values)
+    for kind in kinds_of(rig):
+        inputs, state, changed = kind.associated(inputs, state)
+        values = values | changed
+    return inputs, state, values
 
 
 @dataclass(frozen=True)
@@ -219,10 +223,14 @@ def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequen
     identity = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     factor = initializer_of(rig.sensors[rig.reference]).prior_factor
     imu = assumed_imu(factor * turning, factor * jerking)
-    if not motion_kinds(rig)[0].hosts_keyframes:
-        motion = SmoothMotion(paths, float(turning), float(jerking))
-        imu = replace(imu, pose_keyframes_s=keyframe_spacing(rig, recordings, motion))
-    return rig.with_sensors(imu, replace(rig.sensors[rig.reference], **identity), gravity=0.0, gravity_sigma=0.0)
+    settings = rig.settings
+    if rig.lidars or not motion_kinds(rig)[0].hosts_keyframes:
+        spacing = keyframe_spacing(rig, recordings, SmoothMotion(paths, float(turning), float(jerking)))
+        imu = replace(imu, pose_keyframes_s=spacing)
+        if rig.lidars:  # they measure between the measurements of others, too
+            settings = replace(settings, keyframe_spacing_s=spacing)
+    body = replace(rig.sensors[rig.reference], **identity)
+    return rig.with_sensors(imu, body, gravity=0.0, gravity_sigma=0.0, settings=settings)
 
 
 def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:

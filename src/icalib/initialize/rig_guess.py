@@ -96,7 +96,7 @@ def _trajectory(
     try:
         return kind, source_inputs, kind.trajectory(source_inputs, fallback)
     except EstimationError as error:
-        can_do_without = inputs.rig.wheels and not any(s.needs_imu for s in inputs.rig.mounted)
+        can_do_without = inputs.rig.wheels and not inputs.rig.lidars
         if source_inputs.rig.has_target or not (fallbacks or can_do_without):
             raise
         if not fallbacks:

@@ -199,7 +199,7 @@ def imu_data(rig: Rig, measurements: Measurements) -> ImuData | None:
     """Readings of the rig's IMU, real or assumed; None if it has none."""
     if rig.imu is None or measurements.imu is None:
         return None
-    forwards = rig.assumes_motion and _is_dense(measurements)
+    forwards = rig.assumes_motion and (bool(rig.lidars) or _is_dense(measurements))
     imu, unit = ImuData.build(measurements.imu, rig.imu.noise, forwards, rig.imu.sampling), _unit(rig)
     return imu if unit is None else replace(imu, unit=unit)  # a copy computes its signals anew
 

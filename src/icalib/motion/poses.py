@@ -389,7 +389,7 @@ def sweep(drive: EstimatedMotion, name: str, times: np.ndarray, near: np.ndarray
     """Poses and twists of LiDAR `name` at `times` (n,) on the IMU clock, integrated from the keyframes nearest to
     these, or to `near` (n,)."""
     state, imu = drive.state, drive.imu
-    keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near)
+    keyframe = assign_keyframes("inertial", state.seconds, times if near is None else near, imu.forwards)
     imu_at = poses_without_jacobians(times, keyframe, state, imu, drive.gravity)
     R_il, p_il = state.values[name, "rotation"], state.values[name, "translation"]
     poses = Sweep(imu_at.rotation, imu_at.position, imu_at.rate, imu_at.velocity)
@@ -415,7 +415,7 @@ def is_known(keyframes: np.ndarray, times: np.ndarray) -> np.ndarray:
 
 def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
     """Poses of the IMU at times (n,) on its clock, integrated from the nearest keyframes."""
-    keyframe = assign_keyframes("inertial", motion.state.seconds, times)
+    keyframe = assign_keyframes("inertial", motion.state.seconds, times, motion.imu.forwards)
     return poses_at("inertial", times, keyframe, motion.state, motion.imu, motion.gravity, False)
 
 

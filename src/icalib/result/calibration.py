@@ -269,12 +269,12 @@ class Calibration:
     @property
     def reference(self) -> str:
         """Name of the sensor in whose frame groups and trajectory are given. It is the IMU; without an IMU the first
-        camera if the rig has a target, else the first pose sensor; or else the wheels."""
+        camera if the rig has a target, else the first LiDAR or pose sensor; or else the wheels."""
         if self.imu:
             return self.imu
-        poses = self.of_type("pose")
+        alone = (*self.lidars, *self.of_type("pose"))
         follow = not ({"target", "targets"} & set(self.rig))
-        first = (*poses, *self.cameras) if follow else (*self.cameras, *poses)
+        first = (*alone, *self.cameras) if follow else (*self.cameras, *alone)
         return (*first, *self.of_type("wheels"))[0]
 
     def of_type(self, kind: str) -> tuple[str, ...]:

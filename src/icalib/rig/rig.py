@@ -214,8 +214,9 @@ class Rig:
 
     @property
     def moves_by_poses(self) -> bool:
-        """True if the first pose sensor defines the motion of a rig without an IMU: no camera sees a target."""
-        return bool(self.poses) and not (self.cameras and self.has_target)
+        """True if the first pose sensor defines the motion of a rig without an IMU: there is no LiDAR, and no camera
+        sees a target."""
+        return bool(self.poses) and not self.lidars and not (self.cameras and self.has_target)
 
     @property
     def cameras_alone(self) -> bool:

@@ -90,11 +90,10 @@ class Sensor:
     A kind of sensor declares these class variables. sensor_type: its `type` in the rig file and its folder in
     `icalib.sensors`. noun: its name in messages. readings: its measurements in messages, in the plural. parameters: all
     parameters that sensors of this kind can have. gives_motion: such a sensor and an IMU determine the motion of the
-    rig. needs_imu: what may be done without an IMU, if it needs one. is_inertial: it is an IMU. shows_planes: it
-    measures points on planes. sees_target: it measures points of the target. drives: the rig drives on it, so that it
-    hardly tilts. lens: names of those of `parameters` that are its camera model, empty without one; its projection is
-    what counts of them. may_change: groups of its parameters, by name, that may change together during a recording, as
-    clocks drift and mounts move.
+    rig. is_inertial: it is an IMU. shows_planes: it measures points on planes. sees_target: it measures points of the
+    target. drives: the rig drives on it, so that it hardly tilts. lens: names of those of `parameters` that are its
+    camera model, empty without one; its projection is what counts of them. may_change: groups of its parameters, by
+    name, that may change together during a recording, as clocks drift and mounts move.
     """
 
     sensor_type: ClassVar[str]
@@ -102,7 +101,6 @@ class Sensor:
     readings: ClassVar[str] = "measurements"
     parameters: ClassVar[tuple[ParameterSpec, ...]]
     gives_motion: ClassVar[bool] = False
-    needs_imu: ClassVar[str] = ""
     is_inertial: ClassVar[bool] = False
     shows_planes: ClassVar[bool] = False
     sees_target: ClassVar[bool] = False
@@ -168,8 +166,7 @@ class Sensor:
 
     def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
         """Yields what this sensor needs and the rig lacks: other sensors, or a target."""
-        if self.needs_imu and not has_imu(sensors):
-            yield Lack(("sensors", self.name), f"needs an IMU; add a sensor of type: imu, {self.needs_imu}.")
+        yield from ()
 
     @classmethod
     def stated(cls) -> tuple[ParameterSpec, ...]:

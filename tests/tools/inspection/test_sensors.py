@@ -76,6 +76,9 @@ def drafted(folder: Path) -> Rig:
         ("imu0 mocap0 wheel0", "imu0 wheel0 mocap0"),
         ("mocap0 wheel0", "wheel0 mocap0"),
         ("mocap0 slam0", "mocap0 slam0"),
+        ("lidar0 wheel0", "lidar0 wheel0"),
+        ("lidar0 mocap0", "lidar0 mocap0"),
+        ("cam0/corners lidar0", "cam0 lidar0"),
         ("cam0/corners", "cam0"),
         ("cam0/corners wheel0", "cam0"),
         ("cam0/corners mocap0", "cam0"),
@@ -98,7 +101,7 @@ def test_what_can_be_calibrated_is_not_refused(everything, tmp_path, parts, sens
         ("imu0 wheel0", "wheel0 and imu0 do not determine the motion"),
         ("wheel0", "Without an IMU the motion is unknown from wheel0"),
         ("mocap0", "Beside mocap0 there is no sensor that can be calibrated without an IMU"),
-        ("lidar0", "Without an IMU lidar0 cannot be calibrated"),
+        ("lidar0", "Beside lidar0 there is no sensor that can be calibrated without an IMU"),
     ],
 )
 def test_what_cannot_be_calibrated_is_named(everything, tmp_path, parts, words):

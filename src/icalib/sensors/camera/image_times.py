@@ -29,7 +29,8 @@ def on_common_images(rig: Rig, recording: Measurements) -> Measurements:
         return recording
     if recording.imu is None:
         raise EstimationError(
-            "tracks need an IMU or a pose sensor, for nothing else determines the scale; add one, or remove the tracks."
+            "tracks need an IMU, a LiDAR or a pose sensor, for nothing else determines the scale; add one, or remove "
+            "the tracks."
         )
     corners, tracks = {c.name: c for c in recording.cameras}, {t.name: t for t in recording.tracks}
     pairs = [_together(c.name, corners.get(c.name), tracks.get(c.name)) for c in rig.cameras]

@@ -42,6 +42,7 @@ class LidarInspector(KindInspector):
     prefix: ClassVar[str] = "lidar"
     plain_names: ClassVar[str] = r"scans\.npz|points(_raw)?|\*\.(pcd|ply|bin)"
     is_certain: ClassVar[bool] = True
+    moves_alone: ClassVar[bool] = True
     checks: ClassVar = {"use": refused}
 
     def read(self, recording: Recording, name: str, source: SensorSource) -> Facts:

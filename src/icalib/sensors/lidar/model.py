@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from icalib.data.measurements import LidarStream, Measurements
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel
 from icalib.motion.factor import Factor, Whitened, pairs_of
 from icalib.motion.point_planes import thinned
+from icalib.optim.state import Key
 from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.board_factor import ON_EDGES, BoardFactor
@@ -31,6 +33,13 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         """See `SensorModel`. Only sheets whose distance is known from images show a range offset."""
         at_rest = rig.imu is None and rig.has_target
         return super().is_estimated(sensor, spec, rig) and (spec is not RANGE_OFFSET or at_rest)
+
+    def keyframe_times(
+        self, sensors: Sequence[Lidar], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Times of scans; if the motion is assumed to be smooth, of those of the body alone."""
+        placing = [s for s in sensors if not rig.assumes_motion or s.name == rig.reference_without_imu]
+        return super().keyframe_times(placing, rig, streams, values)
 
     def first_noise(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> dict[str, LidarNoise]:
         loss, scale = rig.settings.loss, rig.settings.loss_scale

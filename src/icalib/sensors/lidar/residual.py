@@ -71,7 +71,7 @@ class LidarFactor(RowFactor):
         values = np.array([motion.state.values[p] for p in planes])
         moments = take_moments(AssociatedPoints(stream, plane, values), motion, noise, bin_s)
         times = instants(stream, motion.state.values, moments.seconds)
-        keyframe = assign_keyframes(scheme, motion.state.seconds, times)
+        keyframe = assign_keyframes(scheme, motion.state.seconds, times, motion.imu.forwards)
         noise_angle = motion.imu.rotation_sigma(motion.state.seconds[keyframe], times)
         if scheme != "inertial":
             noise_angle[:] = 0.0

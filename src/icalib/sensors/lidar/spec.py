@@ -49,9 +49,6 @@ class Lidar(MountedSensor):
     noun: ClassVar[str] = "LiDAR"
     readings: ClassVar[str] = "scans"
     gives_motion: ClassVar[bool] = True
-    needs_imu: ClassVar[str] = (
-        "or run LiDAR odometry, and give its nav_msgs/Odometry as a sensor of type: pose, kind: relative"
-    )
     shows_planes: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, RANGE_OFFSET)
 
@@ -87,18 +84,19 @@ class Lidar(MountedSensor):
             **parameters(fields, cls.stated()),
         )
 
+    def gives_motion_without_imu(self, has_target: bool) -> bool:
+        return True
+
+    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
+        if len(sensors) == 1:
+            yield Lack(("sensors", self.name), "is the only sensor; add the sensors to calibrate it with.")
+
     def plain(self) -> dict[str, Any]:
         plain: dict[str, Any] = {"type": "lidar", "path": self.path, "min_range": self.min_range_m}
         plain |= {"max_range": self.max_range_m, "point_time": self.point_time}
         given = {"range_noise": self.range_noise_m, "topic": self.topic}
         given |= {name: getattr(self, name) for name in ("point_time_field", "point_time_unit")}
         return plain | {name: value for name, value in given.items() if value is not None} | groups_to_plain(self)
-
-    def lacks(self, sensors: Mapping[str, Sensor], has_target: bool) -> Iterator[Lack]:
-        """See `Sensor`. Beside cameras alone that see a target no IMU is needed, if all stand still."""
-        beside_cameras = all(s.sees_target or s.shows_planes for s in sensors.values())
-        if not (has_target and beside_cameras and any(s.sees_target for s in sensors.values())):
-            yield from super().lacks(sensors, has_target)
 
 
 def _point_time(fields: dict[str, YamlValue]) -> PointTime:

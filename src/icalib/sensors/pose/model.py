@@ -37,7 +37,10 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
     def keyframe_times(
         self, sensors: Sequence[PoseSensor], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
     ) -> dict[str, np.ndarray]:
-        """Times of poses of the first sensor, at about the keyframe spacing."""
+        """Times of poses of the first sensor, at about the keyframe spacing; none if another sensor is the body of an
+        assumed motion."""
+        if rig.assumes_motion and sensors[0].name != rig.reference_without_imu:
+            return {}
         imu, stream = rig.imu or ImuSensor, streams[sensors[0].name]  # the default spacing without an IMU
         return {sensors[0].name: instants(stream, values, spaced(stream.seconds, imu.pose_keyframes_s))}
 

@@ -143,8 +143,8 @@ class PoseSensor(MountedSensor):
         if self.kind != "absolute":
             yield Lack(
                 ("sensors", self.name),
-                "without an IMU, or a camera that sees a target, this sensor must determine the motion; write kind: "
-                "absolute, or add one of them.",
+                "without an IMU, a LiDAR, or a camera that sees a target, this sensor must determine the motion; write "
+                "kind: absolute, or add one of them.",
             )
         if len(sensors) == 1:
             yield Lack(("sensors", self.name), "is the only sensor; add the sensors to calibrate it with.")

@@ -35,7 +35,7 @@ Coordinates = Literal["metric", "geodetic"]
 Status = Literal["single", "differential", "float", "fixed"]  # quality of a GNSS fix, worst first
 STATUSES: tuple[Status, ...] = ("single", "differential", "float", "fixed")
 MESSAGES: Literal["messages"] = "messages"
-_ADDITIONS = "an IMU, a camera that sees a target, or a pose sensor"
+_ADDITIONS = "an IMU, a camera that sees a target, a LiDAR or a pose sensor"
 _FIELDS = ("path", "topic", "coordinates", "frame", "position_noise", "position_random_walk", "least_status")
 
 

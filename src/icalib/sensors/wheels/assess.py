@@ -38,7 +38,7 @@ _ROWS = {
     "lateral slip": ("lateral slip", "lateral_slip", "m/sqrt(s)"),
     "vertical slip": ("vertical slip", "vertical_slip", "m/sqrt(s)"),
 }
-UPRIGHT_COSINE = 0.5  # cosine of 60 deg, the largest angle between an axis of the camera and the vertical
+UPRIGHT_COSINE = 0.5  # cosine of 60 deg, the largest angle between an axis of the body and the vertical
 # Radius over baseline: 1/15 of a floor robot to 1 of a toy. Rates in rpm instead of rad/s turn 1/3 into 1/30.
 MIN_RADIUS_RATIO, MAX_RADIUS_RATIO = 1.0 / 25.0, 4.0
 RATE_UNIT_FACTORS = {np.pi / 30.0: "rpm", np.pi / 180.0: "deg/s"}
@@ -61,9 +61,9 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
 
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:
-    """A note if only the assumption of an upright camera decides whether wheels are upside down."""
+    """A note if only the assumption of an upright camera or LiDAR decides whether wheels are upside down."""
     for wheels, up in _without_vertical(inputs, estimate):
-        if not inputs.rig.moves_by_poses and _posture(up) is None:
+        if not inputs.rig.moves_by_poses and _posture(inputs, up) is None:
             yield Remark(
                 "vertical_from_camera",
                 f"{wheels}: nothing but {_body(inputs)}, which then stands upright, shows which way is up; if it is "
@@ -90,7 +90,7 @@ def ground_warnings(estimate: Estimate) -> Iterator[Remark]:
 
 def _upwards_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
     """A warning with both possible verticals if no sensor determines the sign of the vertical, and the assumption of an
-    upright camera does not apply: the motion comes from pose sensors, or the camera is not upright in the result."""
+    upright camera or LiDAR does not apply: the motion comes from pose sensors, or it is not upright in the result."""
     for wheels, up in _without_vertical(inputs, estimate):
         if inputs.rig.moves_by_poses:
             x, y, z = up
@@ -100,7 +100,7 @@ def _upwards_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
                 f"{y:.2f}, {z:.2f}) in the axes of {_body(inputs)}; if that is down, "
                 f"{_other_vertical(inputs, wheels)}.",
             )
-        elif posture := _posture(up):
+        elif posture := _posture(inputs, up):
             yield Remark(
                 "vertical_ambiguous",
                 f"{wheels}: nothing shows which way is up. Either {_body(inputs)} {posture}, or "
@@ -119,10 +119,11 @@ def _without_vertical(inputs: Inputs, estimate: Estimate) -> Iterator[tuple[str,
             yield wheels.name, values[wheels.name, "rotation"][:, 2]
 
 
-def _posture(up: np.ndarray) -> str | None:
-    """The posture of a camera as text for messages, None if it is upright. up (3,): the vertical in camera axes, x
-    right, y down, z forward."""
-    _, down, ahead = up
+def _posture(inputs: Inputs, up: np.ndarray) -> str | None:
+    """The posture of the body as text for messages, None if it is upright. up (3,): the vertical in its axes: of a
+    camera x right, y down, z forward; of a LiDAR x forward, z up."""
+    x, y, z = up
+    down, ahead = (-z, x) if inputs.rig.sensors[_body(inputs)].shows_planes else (y, z)
     if down < -UPRIGHT_COSINE:
         return None
     if down > UPRIGHT_COSINE:

@@ -317,8 +317,6 @@ class KindInspector:
 
     def _draft_lines(self, inspection: Inspection, active: bool) -> Iterator[str]:
         for name, source in inspection.sources.of(self.sensor.sensor_type).items():
-            if self.sensor.needs_imu and not inertial(inspection) and not beside_target(inspection, name):
-                continue
             is_active, topic = active or self.is_certain, source.topic
             yield from (f"  # {line}" for line in self.doubt if not is_active)
             lines = self.lines(inspection, name, topic)
@@ -393,10 +391,10 @@ def rolls(inspection: Inspection) -> bool:
 
 
 def without_imu(inspection: Inspection) -> tuple[str, ...]:
-    """Names of `dependent` sensors that need no IMU; those that give the motion without an IMU first."""
-    free = dependent(inspection, lambda kind: not kind.sensor.needs_imu)
+    """Names of `dependent` sensors; those that give the motion without an IMU first, and of these LiDARs."""
     alone = dependent(inspection, lambda kind: kind.moves_alone)
-    return tuple(sorted(free, key=lambda name: name not in alone))
+    lidars = dependent(inspection, lambda kind: kind.sensor.shows_planes)
+    return tuple(sorted(dependent(inspection), key=lambda name: (name not in lidars, name not in alone)))
 
 
 def moves_without_imu(inspection: Inspection) -> bool:
@@ -575,8 +573,6 @@ def _alone(inspection: Inspection) -> str:
     if not others:
         return "There is no sensor to calibrate"
     names = " and ".join(others)
-    if others == dependent(inspection, lambda kind: kind.sensor.needs_imu):
-        return f"Without an IMU {names} cannot be calibrated"
     if dependent(inspection, lambda kind: kind.moves_alone):
         return f"Beside {without_imu(inspection)[0]} there is no sensor that can be calibrated without an IMU"
     return f"Without an IMU the motion is unknown from {names}"

@@ -233,9 +233,10 @@ def _degeneracy_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]
     normals = np.array([estimate.outcome.state.values[key][:3] for key in inputs.association.keys])
     if count_directions(normal_shares(normals, inputs.association.points)) < 3:
         names = " and ".join(x.name for x in inputs.rig.lidars)
+        source = "the assumption of smooth motion" if inputs.rig.assumes_motion else "the IMU"
         yield Remark(
             "scene_like_corridor",
-            f"the planes that {names} saw face two directions only, as in a corridor: only the IMU constrains the "
+            f"the planes that {names} saw face two directions only, as in a corridor: only {source} constrains the "
             "motion along both. Do not trust the result if the solver did not converge; better record where walls and "
             "floor face three directions.",
         )

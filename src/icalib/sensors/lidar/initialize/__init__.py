@@ -10,11 +10,13 @@ from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs, with_association
 from icalib.initialize.initializer import (
     BY_SCANS,
+    BodyTrajectory,
     FailedEstimate,
     InitialGuess,
     Initializer,
     InputsWithMotion,
     MotionSource,
+    SmoothMotion,
     Values,
     stated_values,
 )
@@ -23,6 +25,7 @@ from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.initialize.association import lidar_values, state_from_lidar, with_lidars
 from icalib.sensors.lidar.initialize.boards import guess_at_rest, is_at_rest
+from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error
 
@@ -34,11 +37,19 @@ class LidarInitializer(Initializer[Lidar]):
     moves_keyframes = True
 
     def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
-        """With an IMU, the recordings without points on the robot itself."""
-        return recordings if rig.imu is None else [without_self_returns(m) for m in recordings]
+        """The recordings without points on the robot itself. Without an IMU, a rig that sees a target may be at rest,
+        and all points keep their place."""
+        return recordings if rig.imu is None and rig.has_target else [without_self_returns(m) for m in recordings]
 
     def motion_source(self, rig: Rig) -> MotionSource | None:
         return MotionSource(BY_SCANS, tuple(s.name for s in rig.lidars)) if rig.lidars else None
+
+    def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
+        return BodyTrajectory([scan_poses(m.lidars[0]) for m in recordings])
+
+    def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
+        """As short as allowed: points are measured at all times, and thousands of them average out noise."""
+        return 0.0
 
     def trajectory(self, inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> State:
         return state_from_lidar(inputs)
@@ -65,13 +76,10 @@ class LidarInitializer(Initializer[Lidar]):
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> InitialGuess | None:
-        """See `Initializer`: by the target in images and clouds. Raises EstimationError if the rig moved."""
-        if is_at_rest(rig, body_poses):
+        """See `Initializer`: by the target in images and clouds."""
+        if rig.has_target and is_at_rest(rig, body_poses):
             return guess_at_rest(rig, recordings, body_poses, values)
-        raise EstimationError(
-            f"{rig.lidars[0].name}: without an IMU the rig must stand still at each image, with cameras and LiDARs "
-            "only; take one image and one cloud at each stop, or add a sensor of type: imu."
-        )
+        return None
 
     def explained(self, failed: FailedEstimate) -> EstimationError | None:
         """See `Initializer`: during an attempt, the error that names a degenerate scene."""

@@ -17,6 +17,7 @@ from icalib.initialize.initializer import (
 )
 from icalib.initialize.rate_alignment import RateAlignment, only_axis
 from icalib.initialize.rate_correlation import GyroRotation, SensorRates
+from icalib.initialize.smooth_trajectory import BodyPoses
 from icalib.initialize.trajectories import (
     DISPLACEMENT_SIGMA_M,
     MAX_PROPAGATION_S,
@@ -55,6 +56,13 @@ def lidar_and_motion(
     _check_axes(stream.name, imu.name, fit.mirrored)
     _check_gravity(fit.gravity, gravity, imu.name, stream.name)
     return fit.guess, fit.motion
+
+
+def scan_poses(stream: LidarStream) -> BodyPoses:
+    """Poses of a LiDAR, three in each scan, by odometry alone. Raises EstimationError if it fails."""
+    path = lidar_trajectory(stream.name, sampled_scans(stream), shares=(-1.0 / 3.0, 0.0, 1.0 / 3.0))
+    path = path.only(path.ok)
+    return BodyPoses(path.seconds, path.rotation, path.position)
 
 
 def lidar_on_motion(

@@ -98,8 +98,10 @@ def lidar_trajectory(
     rotation_at: RotationAt | None = None,
     position_at: PositionAt | None = None,
     single_map: bool = True,
+    shares: tuple[float, ...] = (0.0,),
 ) -> SensorTrajectory:
-    """Scan-to-map odometry of LiDAR `name`: poses at the middles of scans in the frame of the map.
+    """Scan-to-map odometry of LiDAR `name`: poses in the frame of the map, at the middles of scans, or `shares` of the
+    duration of a scan before and after them.
 
     rotation_at, position_at: known rotations, and approximate positions. single_map: one map for all scans; scans
     before it that fit no map are not ok. Otherwise a new map starts if the LiDAR is lost. Scans within MAX_SCAN_STEP_S
@@ -119,7 +121,12 @@ def lidar_trajectory(
             f"{name}: only {ok.sum()} of {len(scans)} scans match the surfaces of other scans; "
             f"{_mismatch_cause(scans, edge_m)}."
         )
-    return SensorTrajectory(seconds, np.array([p.rotation for p in poses]), np.array([p.position for p in poses]), ok)
+    aside = np.array([np.ptp(s.tau) for s in scans])[:, None] * np.array(shares)  # (scans, shares) from the middles [s]
+    R, p, rate, velocity = (np.repeat([getattr(x, f) for x in poses], len(shares), axis=0) for f in ScanPose._fields)
+    step = aside.reshape(-1, 1)
+    return SensorTrajectory(
+        (seconds[:, None] + aside).ravel(), R @ so3.exp_many(step * rate), p + step * velocity, ok.repeat(len(shares))
+    )
 
 
 def _mismatch_cause(scans: list[Scan], edge_m: float) -> str:
