@@ -3,8 +3,9 @@
     off(x) = n . R_scene_body^T (R_scene_lidar x (1 - range_offset / |x|) + p_scene_lidar - p_scene_body) - reach
 
 The print of each body is in its plane z = 0, n = (0, 0, 1), whose pose the corners in the images give: no plane is
-estimated. The residual of a point is off(x), its distance from the sheet. range_offset [m] is what the LiDAR measures
-too much, the same for all points.
+estimated. The residual of a point is its distance from the sheet along its beam u, off(x) / (n . u), as range noise is
+along the beam. Distances along n would tilt the sheet: noise moves points of oblique beams sideways, too. range_offset
+[m] is what the LiDAR measures too much, the same for all points.
 
 If the size of the sheet is given, its edges are planes at right angles to it, with outward normals n. A ring crosses
 two of them, at x and y. Its residual is (off(y) - off(x)) / 2: how far the middle of its part on the sheet is off. Wide
@@ -66,10 +67,12 @@ class BoardPoints:
             xyz = stream.xyz[stream.start[scan] : stream.start[scan + 1]].astype(np.float64)
             k = np.full(len(xyz), keyframe[scan])
             world = in_scene(xyz, stream.name, k, state)
+            R_body, p_body = state.rotation[keyframe[scan]], state.position[keyframe[scan]]
+            origin = R_body @ state.values[stream.name, "translation"] + p_body
             for b in bodies.used:
                 places = np.array([scan, keyframe[scan], b])
                 y, outline = (world - p[b]) @ R[b], bodies.target.outlines[b]
-                used = xyz[on_sheet(y, outline, -RIM_M, gate_m)]
+                used = xyz[_hits_sheet(y, (origin - p[b]) @ R[b], outline, gate_m)]
                 sheets.append((np.tile(places, (len(used), 1)), used, np.tile([0.0, 0.0, 1.0, 0.0], (len(used), 1))))
                 if bodies.target.has_sheet[b]:
                     at, plane = edge_points(xyz, y, outline, gate_m)
@@ -104,6 +107,15 @@ def on_sheet(points: np.ndarray, outline: np.ndarray, margin_m: float, gate_m: f
     xy, (low, high) = points[:, :2], outline
     inside = (xy > low - margin_m).all(axis=1) & (xy < high + margin_m).all(axis=1)
     return inside & (np.abs(points[:, 2]) < gate_m)
+
+
+def _hits_sheet(points: np.ndarray, origin: np.ndarray, outline: np.ndarray, gate_m: float) -> np.ndarray:
+    """(n,) bool: points (n, 3) near the sheet whose beams from `origin` (3,) meet it inside its rim. The points
+    themselves would be chosen by their noise, which moves those of oblique beams across the rim."""
+    height = np.where(np.abs(points[:, 2] - origin[2]) < gate_m, np.inf, points[:, 2] - origin[2])
+    met = origin + (points - origin) * (-origin[2] / height)[:, None]
+    near = np.abs(points[:, 2]) < gate_m
+    return near & on_sheet(met, outline, -RIM_M, np.inf)
 
 
 # Where rings of a spinning LiDAR cross the edges of a sheet: half a step beyond the last beam that hits it.
@@ -203,19 +215,17 @@ class BoardFactor(RowFactor):
                     f"{stream.name}, and the extrinsics in the rig file."
                 )
             one = cls(stream.name, kind, points, np.ones(n), noise, at.bodies, at.starts, count, at.layout, at.imu)
-            cosine = one.rows_of_points(slice(None), at.state, True)[1]
-            sigma = noise.inflation * np.sqrt(noise.sigma**2 + (noise.beam_sigma * cosine) ** 2)
+            sigma = noise.inflation * float(np.hypot(noise.sigma, noise.beam_sigma))
             if n:
-                yield replace(one, sigma=sigma if kind == ON_BOARDS else np.full(n // 2, noise.edge_sigma))
+                yield replace(one, sigma=np.full(n, sigma) if kind == ON_BOARDS else np.full(n // 2, noise.edge_sigma))
 
     def noise_sizes(self, out: Whitened) -> tuple[float, float]:
-        """Standard deviation [m] of points about the plane that fits them best at one stop, and how many times larger
-        it is in what these planes show: offset and two tilts against the sheet. At least 1, if errors of the points at
-        a stop correlate."""
-        raw, root = self.raw(out)[:, 0], out.root[:, 0]
+        """Standard deviation [m] of residuals about what fits those of each stop best, an offset and two tilts; and how
+        many times larger it is in these offsets and tilts. This is above 1 if errors of one stop correlate."""
+        raw, root, xyz = self.raw(out)[:, 0], out.root[:, 0], self.points.xyz[:: self.points_per_row]
         squares, planes, n = np.zeros(2), 0, 0
-        for stop in np.split(np.arange(len(raw)), np.flatnonzero(np.diff(self.points.keyframe)) + 1):
-            x = self.points.xyz[stop] - self.points.xyz[stop].mean(axis=0)
+        for stop in np.split(np.arange(len(raw)), np.flatnonzero(np.diff(self.keyframe)) + 1):
+            x = xyz[stop] - xyz[stop].mean(axis=0)
             axes = np.linalg.svd(x, full_matrices=False)[2][:2]
             basis, _ = np.linalg.qr(root[stop, None] * np.column_stack([np.ones(len(x)), x @ axes.T]))
             weighted = root[stop] * raw[stop]
@@ -287,6 +297,10 @@ class BoardFactor(RowFactor):
         y = np.einsum("nij,nj->ni", at.rotation, x) + at.position - origin[body]
         residual = (in_scene * y).sum(axis=1) - p.reach[block]
         cosine = (normal * beam).sum(axis=1)
+        scale = np.ones(len(x))
+        if self.kind == ON_BOARDS:  # along the beam, as its noise is; the derivative is where the beam meets the sheet
+            residual, scale = residual / cosine, cosine
+            x, y = x - residual[:, None] * beam, y - residual[:, None] * np.einsum("nij,nj->ni", at.rotation, beam)
         if not jacobians:
             return Rows(residual[:, None], np.zeros((0, 1, 0))), cosine
         J_further = np.zeros((len(x), 1, 1 + self.bodies.columns(self.layout)[0].size))
@@ -294,5 +308,6 @@ class BoardFactor(RowFactor):
         if self.bodies.several:
             J_body = np.concatenate([np.cross(of_body, np.einsum("nij,ni->nj", R[body], y)), -in_scene], axis=1)
             J_further[np.arange(len(x))[:, None], 0, 1 + 6 * body[:, None] + np.arange(6)] = J_body
-        J_pose = np.concatenate([np.cross(x, normal), normal], axis=1)[:, None, :]
+        J_pose = np.concatenate([np.cross(x, normal), normal], axis=1)[:, None, :] / scale[:, None, None]
+        J_further /= scale[:, None, None]
         return rows_at(residual[:, None], (J_pose,), (at,), J_further), cosine

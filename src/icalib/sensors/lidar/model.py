@@ -92,11 +92,9 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
 def _on_boards(sensor: Lidar, noise: LidarNoise, factor: BoardFactor, out: Whitened) -> LidarNoise:
     """The noise with what the residuals `out` of one factor show: of rings, or of points unless the rig file states it,
     and how far errors of the points at a stop correlate."""
-    if factor.kind == ON_EDGES:
-        weight = out.root[:, 0] ** 2
-        sigma = float(np.sqrt(weight @ factor.raw(out)[:, 0] ** 2 / max(weight.sum(), 1.0)))
-        return replace(noise, edge_sigma=max(sigma, MIN_RANGE_SIGMA_M))
     sigma, inflation = factor.noise_sizes(out)
+    if factor.kind == ON_EDGES:
+        return replace(noise, edge_sigma=max(inflation * sigma, MIN_RANGE_SIGMA_M))
     noise = replace(noise, inflation=inflation)
     return noise if sensor.range_noise_m is not None else replace(noise, sigma=max(sigma, MIN_RANGE_SIGMA_M))
 

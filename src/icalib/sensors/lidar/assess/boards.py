@@ -59,7 +59,7 @@ def _residuals(a: AssessedEstimate, state: State) -> Iterator[LidarResiduals]:
             a.timeline.on_result_clock(seconds, a.timeline.recording_of(seconds)),
             points.body.astype(np.int32),
             np.linalg.norm(points.xyz, axis=1).astype(np.float32),
-            f.sigma.astype(np.float32),
+            (f.sigma * np.abs(f.rows_of_points(slice(None), state, False)[1])).astype(np.float32),
             world,
             residual,
             first_world,

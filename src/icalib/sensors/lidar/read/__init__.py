@@ -106,7 +106,8 @@ def scans(recording: Recording, sensor: Lidar) -> LidarStream:
 
 def source(recording: Recording, sensor: Lidar) -> Path | TopicInfo:
     """File or topic of the scans."""
-    if recording.has_messages or isinstance(recording, PictureFolder):
+    has_clouds = isinstance(recording, PictureFolder) and any(t.kind == "points" for t in recording.topics())
+    if recording.has_messages or has_clouds:
         return recording.topic(sensor.name, sensor.topic, "points")
     return recording.table(sensor, sensor.path)
 
