@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, NoTarget, Scene, Target
 from icalib.geometry.targets.families import family_name
 from icalib.rig.rig import ANYWHERE, SENSOR_TYPES, Gravity, Rig, Settings, by_name, gravity_to_plain, parse_gravity
-from icalib.sensors.imu.spec import ImuSensor
 from icalib.sensors.sensor import MOUNTED_NAMES, TARGET_FRAME, Lack, Sensor, has_imu
 
 
@@ -303,7 +301,9 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
 def _mounted_body(rig: Rig) -> Iterator[Lack]:
     """Extrinsics or a time offset of the IMU to which those of all other sensors refer."""
     others = " or ".join(s.name for s in rig.further_imus)
-    for imu, name in itertools.product(rig.of(ImuSensor)[:1], MOUNTED_NAMES):
+    if (imu := rig.imu) is None:
+        return
+    for name in MOUNTED_NAMES:
         stated = getattr(imu, name)
         if stated.mode != "free" or stated.value is not None:
             advice = f", or make {others} the body with body: {rig.further_imus[0].name}" if others else ""

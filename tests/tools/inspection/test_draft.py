@@ -403,8 +403,8 @@ def test_no_draft_without_camera(bags, brief, tmp_path, capsys):
     bag = bags.write(tmp_path / "run", bags.imu("/imu0", brief))
     assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "-q"]) == 1
     assert (
-        "holds no camera that can be read, no LiDAR, pose sensor or position sensor beside an IMU, and no pose sensor"
-        in capsys.readouterr().err
+        "holds no camera that can be read, no LiDAR, pose sensor or position sensor beside an IMU, and no LiDAR or "
+        "pose sensor" in capsys.readouterr().err
     )
     assert not (tmp_path / "rig.yaml").exists()
 
