@@ -76,6 +76,42 @@ def test_cut_files_are_refused(tmp_path, name):
         read_cloud(tmp_path / name)
 
 
+def lzf(*control: int, size: int = 17 * 300) -> bytes:
+    return pcd("binary_compressed", struct.pack("<II", len(control), size) + bytes(control))
+
+
+DAMAGED = {
+    "literals beyond the end.pcd": lambda: lzf(31, 1, 2),
+    "a copy from before the start.pcd": lambda: lzf(7 << 5, 255, 255, 0, *[0] * 60),
+    "a copy without its place.pcd": lambda: lzf(0, 7, 7 << 5, *[0] * 60),
+    "a copy beyond the end.pcd": lambda: lzf(0, 7, *[7 << 5, 255, 0] * 60),
+    "too short.pcd": lambda: lzf(0, 7, *[0, 0] * 40),
+    "a size of 4 GiB.pcd": lambda: lzf(0, 7, size=2**32 - 1),
+    "huge.pcd": lambda: FILES["binary.pcd"]().replace(b"WIDTH 300", b"WIDTH " + b"9" * 30),
+    "negative.pcd": lambda: FILES["binary.pcd"]().replace(b"WIDTH 300", b"WIDTH -1"),
+    "of texts.pcd": lambda: FILES["binary.pcd"]().replace(b"TYPE U F", b"TYPE U O"),
+    "several x.pcd": lambda: FILES["binary.pcd"]().replace(b"COUNT 1 1 1 1 2", b"COUNT 1 2 2 2 2"),
+    "no points.pcd": lambda: pcd("ascii", b"\n"),
+    "no format.ply": lambda: FILES["little.ply"]().replace(b"format", b"comment"),
+    "other format.ply": lambda: FILES["little.ply"]().replace(b"little", b"middle"),
+    "no end.ply": lambda: FILES["little.ply"]().replace(b"end_header", b""),
+    "empty.bin": lambda: b"",
+}
+
+
+@each("name", DAMAGED)
+def test_damaged_files_are_refused(tmp_path, name):
+    (tmp_path / name).write_bytes(DAMAGED[name]())
+    with pytest.raises(RecordingError, match="is no complete point cloud"):
+        read_cloud(tmp_path / name)
+
+
+def test_a_header_with_other_line_ends(tmp_path):
+    head, end, body = FILES["little.ply"]().partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes((head + end).replace(b"\n", b"\r\n") + body)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "a.ply"), POINTS)
+
+
 def stops(folder) -> PictureFolder:
     for number in (12, 3, 7):
         picture(folder / f"pose{number}.png", number)
