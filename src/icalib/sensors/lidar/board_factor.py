@@ -124,7 +124,7 @@ RING_GAP_RAD = np.deg2rad(0.08)  # elevations of rings are farther apart: 0.11 d
 EDGE_GATE_M = 0.06  # largest distance of a crossing from the outline
 FEWEST_ON_RING = 6
 END_POINTS = 6  # last points of a ring on the sheet, whose line gives the range at the edge
-MOST_GRAZING = 0.5  # cosine of the smallest angle at which a ring crosses an edge
+MOST_GRAZING = 0.5  # cosine of the largest angle between a ring and the normal of the edge that it crosses: 60 deg
 
 
 def edge_points(
@@ -150,12 +150,14 @@ def _ends_of_ring(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Both ends of a ring on a sheet: points (2, 3) and edges (2, 4) as in `edge_points`; None if it has none."""
     hits = ring[on_sheet(in_body[ring], outline, EDGE_GATE_M, gate_m)]
-    if len(hits) < FEWEST_ON_RING:
-        return None
+    if len(hits) < FEWEST_ON_RING or np.ptp(elevations(xyz[hits])) > 2.0 * RING_GAP_RAD:
+        return None  # a LiDAR without rings, or with rings that do not share an origin
     x, y = xyz[hits, :2].mean(axis=0)
     azimuth = np.arctan2(x * xyz[hits, 1] - y * xyz[hits, 0], x * xyz[hits, 0] + y * xyz[hits, 1])
-    order = np.argsort(azimuth)
-    hits, azimuth = hits[order], azimuth[order]
+    azimuth, order = np.unique(azimuth, return_index=True)  # one of several returns of a beam
+    hits = hits[order]
+    if len(hits) < FEWEST_ON_RING:
+        return None
     both, step = np.concatenate([xyz[hits], in_body[hits]], axis=1), float(np.median(np.diff(azimuth)))
     ends = []
     for sign, end in ((-1.0, slice(0, END_POINTS)), (1.0, slice(-END_POINTS, None))):

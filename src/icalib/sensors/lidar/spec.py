@@ -28,7 +28,7 @@ RANGE_OFFSET = ParameterSpec(
     tolerance=5e-3,
     prior_sigma=0.03,  # range accuracy that data sheets of spinning LiDARs state, as the VLP-16's
     is_auxiliary=True,
-    meaning="what the LiDAR measures too much, the same at all ranges",
+    meaning="measured less true range, the same at all ranges",
     motion="show the board nearer and farther",
 )
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]

@@ -113,7 +113,7 @@ def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> n
     R, origin = stops.T_cam_lidar[:3, :3], stops.T_cam_lidar[:3, 3]
     rays = beams @ R.T
     ahead = np.where(rays > 0.0, 1.0, -1.0) * stops.room_m - origin
-    distance = (ahead / np.where(rays == 0.0, 1e-12, rays)).min(axis=1)
+    distance = (ahead / np.where(rays == 0.0, -1e-12, rays)).min(axis=1)
     for T in (T_cam_board, *stops.panels):
         distance = np.minimum(distance, _to_sheet(T, stops.target.outlines[0], origin, rays))
     measured = distance + stops.range_offset_m + stops.range_noise_m * rng.standard_normal(len(distance))

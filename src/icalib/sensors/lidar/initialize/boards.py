@@ -101,7 +101,7 @@ def _sheet(points: np.ndarray, size: np.ndarray) -> tuple[np.ndarray, np.ndarray
 LARGEST_TURN = np.deg2rad(15.0)  # between the normal of a cluster and that of the sheet
 SHIFT_SHARE = 0.35  # of the sheet's shorter side: distance between the centres of a cluster and the sheet
 MOST_PAIRS = 300  # pairs of stops that are tried
-FEWEST_STOPS = 2
+FEWEST_STOPS = 3  # two define the pose; the third confirms it
 FIT_ROUNDS = 20
 FIT_GATE_M = 0.1  # of points from their sheet; the range offset of LiDARs is below
 CENTRE_SIGMA_M, POINT_SIGMA_M = 0.1, 0.02  # of a cluster's centre, which rings sample, and of a point on the sheet
@@ -243,7 +243,8 @@ def _at_stops(m: Measurements, body: BodyPoses) -> Measurements:
         apart = np.abs(seconds - body.seconds[k])
         stop_s = float(np.median(np.diff(body.seconds))) if len(body.seconds) > 1 else np.inf
         near = np.flatnonzero(apart < SAME_STOP_SHARE * stop_s)
-        near = near[np.unique(k[near], return_index=True)[1]]
+        near = near[np.lexsort((apart[near], k[near]))]
+        near = np.sort(near[np.unique(k[near], return_index=True)[1]])  # the nearest of each stop
         kept = np.zeros(len(stream.stamps_ns), bool)
         kept[near] = True
         some = stream.some(np.repeat(kept, np.diff(stream.start)))
@@ -266,6 +267,11 @@ def _extrinsics(inputs: Inputs, sensor: Lidar, recordings: Sequence[Measurements
             rotation.append(R)
             centre.append(R @ (middle - poses.position[k]))
             clouds.append(stream.xyz[a:b].astype(np.float64))
+    if len(clouds) < FEWEST_STOPS:
+        raise EstimationError(
+            f"{sensor.name}: clouds of {len(clouds)} stops at which the cameras see the target are too few, at least "
+            f"{FEWEST_STOPS} are needed; record more stops, with the board tilted differently at each."
+        )
     sheets = Sheets(np.array(rotation), np.array(centre), high - low)
     best = pose_by_sheets(sheets, clouds)
     if best is None:
