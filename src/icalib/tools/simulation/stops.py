@@ -10,10 +10,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from icalib.data.measurements import LidarStream, Measurements
+from icalib.data.measurements import CornerStream, LidarStream, Measurements
 from icalib.geometry.targets import Checkerboard, Target
 from icalib.rig import Camera, Lidar, Parameter, Rig, Settings, by_name
-from icalib.sensors.camera.stream import CornerStream
 from icalib.tools.simulation.motion import rotation_from_vector
 from icalib.tools.simulation.projection import project, visible
 from icalib.tools.simulation.scenario import SimCamera
