@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.consistency.cases import Case, Check, body_is, known, off_below, parameters, planes_found
+from tests.consistency.cases import Case, Check, body_is, known, notes, off_below, parameters, planes_found
 from tests.consistency.recordings import make_robot, mocap, steady
+from tests.typed import not_none
 
 from icalib.data.measurements import Measurements
 from icalib.rig import Rig
@@ -30,6 +31,15 @@ def two_lidars() -> Scenario:
     return scenario.with_sensors(replace(first, name="lidar1", T_imu_sensor=ASIDE, time_offset_s=0.03))
 
 
+def on_its_side() -> Scenario:
+    """Two LiDARs in a small room. The first hardly sees one pair of walls, and its odometry drifts by 0.6 m."""
+    scenario = two_lidars()
+    first, second = scenario.of(SimLidar)
+    T = first.T_imu_sensor @ np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    small = replace(not_none(scenario.room), size=(6.0, 5.0, 2.6), blocks=())
+    return replace(scenario.with_sensors(replace(first, T_imu_sensor=T), second), room=small)
+
+
 def without_imu(simulation: Simulation) -> Rig:
     return steady(rig_for(simulation.scenario)).with_(imu=None)
 
@@ -46,6 +56,12 @@ def near(sensor: str, degrees: float, mm: float, ms: float) -> list[Check]:
 CASES: dict[str, Case] = {
     "two LiDARs": Case(
         lambda: ideal(two_lidars()), [*near("lidar1", 0.05, 2.0, 0.2), body_is("lidar0")], without_imu, seen
+    ),
+    "LiDAR on its side": Case(
+        lambda: ideal(on_its_side()),
+        [*near("lidar0", 0.05, 2.0, 0.2), body_is("lidar0"), notes("motion_by_other_sensor")],
+        without_imu,
+        seen,
     ),
     "wheels": Case(
         lambda: ideal(make_robot("ramp", 12.0, "lw", STEPS)),

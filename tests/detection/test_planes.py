@@ -79,6 +79,19 @@ def test_a_thin_wall_has_two_sides():
         assert len(set(own[own >= 0])) == 1
 
 
+@pytest.mark.parametrize(("gap", "seen_from", "share"), [(0.5, 3.0, 0.5), (0.5, 0.25, 0.0), (0.0, 3.0, 0.0)])
+def test_a_wall_that_stands_twice_is_seen_through(gap: float, seen_from: float, share: float):
+    """The lower half of the points lies `gap` below the others. From between both nothing is seen through."""
+    rng = np.random.default_rng(4)
+    points = np.concatenate([sheet(rng, 20000, 4.0), sheet(rng, 20000, 4.0, -gap)])
+    origins = np.full((40000, 3), [0.0, 0.0, 3.0])
+    origins[20000:, 2] = seen_from - gap
+    search = PlaneSearch()
+    found = find_planes(points, origins, search)
+    plane = found.of_points(points, origins, search)
+    assert found.share_seen_through(points, origins, plane, search) == pytest.approx(share, abs=0.05)
+
+
 def test_a_wall_between_voxels_is_one_plane_where_it_is():
     """Half of its noise is in either layer of voxels, whose own means are 2.4 cm off."""
     rng = np.random.default_rng(2)

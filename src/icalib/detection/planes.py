@@ -83,6 +83,14 @@ class ExtractedPlanes:
         none."""
         return _associate(self.cells, points, origins, search.variance(points, origins), search)[0]
 
+    def share_seen_through(
+        self, points: np.ndarray, origins: np.ndarray, plane: np.ndarray, search: PlaneSearch
+    ) -> float:
+        """Share of the points on planes whose beams passed through another plane; see `seen_through`. plane (N,): of
+        each point."""
+        count = seen_through(points, origins, plane, EXCLUSIVE_GATES * search.gate * search.noise_m, self.cells)
+        return count / max(np.count_nonzero(plane >= 0), 1)
+
 
 def find_planes(points: np.ndarray, origins: np.ndarray, search: PlaneSearch = PlaneSearch()) -> ExtractedPlanes:
     """Planes of points (N, 3) with sensor positions `origins` (N, 3), both in the world frame [m]; the plane with most
@@ -317,6 +325,7 @@ def _unevenness(stats: np.ndarray) -> float:
 MOMENTS = 10  # sums of 1; x, xx; y, yx, yy; z, zx, zy, zz
 LARGEST_TURN = 0.26  # rad: largest angle between the normals of a voxel, which is inaccurate, and of its region
 EXCLUSIVE_GATES = 1.6  # gates: least distance between a point and any other plane
+SAME_SIDE = 0.5  # cosine between the normals of planes that face the same way
 REGION_REACH = 2.5  # standard deviations: largest distance between a voxel's centre and the plane of its region
 
 
@@ -499,6 +508,39 @@ def associate(points, origins, variance, cells, gate, least_cosine, plane, cell,
                     break
             else:
                 plane[n], cell[n], distance[n] = q_hit, k_hit, r[q_hit]
+
+
+@njit(cache=True, nogil=True)
+def seen_through(points, origins, plane, reach, cells):
+    """Number of points whose beam passed through another plane that faces the sensor and is alike (SAME_SIDE), more
+    than `reach` [m] in front of their own. Surfaces are opaque: one that drift has doubled is seen through the other.
+
+    points, origins (N, 3) m: as in `associate`; plane (N,): of each point, -1 for none.
+    """
+    count = 0
+    for n in range(len(points)):
+        if plane[n] < 0:
+            continue
+        its_plane = cells.planes[plane[n]]
+        for q in range(len(cells.planes)):
+            p = cells.planes[q]
+            if q == plane[n] or its_plane[0] * p[0] + its_plane[1] * p[1] + its_plane[2] * p[2] < SAME_SIDE:
+                continue
+            before, behind = 0.0, 0.0
+            for i in range(3):
+                before += p[i] * (origins[n, i] - p[3 + i])
+                behind -= p[i] * (points[n, i] - p[3 + i])
+            if before <= 0.0 or behind <= reach:
+                continue
+            s = before / (before + behind)
+            x = origins[n, 0] + s * (points[n, 0] - origins[n, 0])
+            y = origins[n, 1] + s * (points[n, 1] - origins[n, 1])
+            z = origins[n, 2] + s * (points[n, 2] - origins[n, 2])
+            k = _reach(q, x, y, z, cells)
+            if k >= 0 and cells.use[k] == INSIDE:
+                count += 1
+                break
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from icalib.data.measurements import ImuStream, Measurements, PoseStream
+from icalib.base.remark import Remark
+from icalib.data.measurements import ImuStream, Measurements, PoseStream, streams_of_rig
 from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs, inputs_for
 from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
@@ -62,7 +63,7 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
     source, trajectory = motion_kinds(rig)[0], None
     try:
         trajectory = source.body_poses(rig, recordings)
-        return _guess(rig, recordings, trajectory)
+        return _guess(*_led_by(trajectory.reference, rig, recordings), trajectory)
     except EstimationError as error:
         contradicted = trajectory if isinstance(error, MotionContradictedError) else None
         for words, converted in contradicted.conventions if contradicted else ():
@@ -75,6 +76,19 @@ def guess_with_assumed_motion(rig: Rig, recordings: Sequence[Measurements]) -> I
             body = next(s for s in recordings[0].streams.values() if s.name == rig.reference)
             error.args = (_with_rate(str(error), body),)
         raise
+
+
+def _led_by(reference: str, rig: Rig, recordings: Sequence[Measurements]) -> tuple[Rig, Sequence[Measurements]]:
+    """The rig with another reference, if one is given, and its recordings. Poses stay in the frame of the body."""
+    if not reference:
+        return rig, recordings
+    led = replace(rig, sensors={reference: rig.sensors[reference], **rig.sensors}, body=rig.body or rig.reference)
+    note = Remark(
+        "motion_by_other_sensor",
+        f"{reference} shows the motion better than {rig.reference}, so time offsets refer to the clock of {reference}.",
+    )
+    first, *others = (streams_of_rig(led, m) for m in recordings)
+    return led, [replace(first, notes=(*first.notes, note)), *others]
 
 
 def _with_rate(sentence: str, body: Stream) -> str:

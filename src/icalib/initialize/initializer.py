@@ -57,11 +57,13 @@ class MotionSource(NamedTuple):
 @dataclass(frozen=True)
 class BodyTrajectory:
     """Poses of the body in each recording, without an IMU. values: of the sensors, estimated with them; conventions:
-    recordings with measurements converted from another convention, each with a sentence that names it."""
+    recordings with measurements converted from another convention, each with a sentence that names it; reference: the
+    sensor whose poses they are, if the rig's own `reference` shows the motion less well."""
 
     poses: list[BodyPoses]
     values: Values = field(default_factory=dict)
     conventions: Iterable[tuple[str, list[Measurements]]] = ()
+    reference: str = ""
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,13 @@ from icalib.rig import ImuSensor, Lidar, Settings
 from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.initialize.association import ASSOCIATION_ROUNDS, associate, check_shares, round_search
+from icalib.sensors.lidar.initialize.association import (
+    ASSOCIATION_ROUNDS,
+    associate,
+    check_opaque,
+    check_shares,
+    round_search,
+)
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.residual import LidarFactor
 
@@ -182,3 +188,9 @@ def test_many_recordings(robot, example, turn, way, late, wrong):
 def test_planes_that_get_lost_from_round_to_round_are_an_error(shares: tuple[float, ...], lost: bool):
     with pytest.raises(EstimationError, match="lidar0.*15%, then 6%") if lost else nullcontext():
         check_shares(shares, "lidar0")
+
+
+@each(("share", "drifted"), [(0.012, False), (0.078, True)])
+def test_walls_that_stand_twice_are_an_error(share: float, drifted: bool):
+    with pytest.raises(EstimationError, match="8% .* lidar0 .* walls stand twice") if drifted else nullcontext():
+        check_opaque(share, "lidar0")

@@ -27,7 +27,7 @@ from icalib.sensors.lidar.initialize.association import lidar_values, state_from
 from icalib.sensors.lidar.initialize.boards import guess_at_rest, is_at_rest
 from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
-from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error
+from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error, leading
 
 
 class LidarInitializer(Initializer[Lidar]):
@@ -45,7 +45,10 @@ class LidarInitializer(Initializer[Lidar]):
         return MotionSource(BY_SCANS, tuple(s.name for s in rig.lidars)) if rig.lidars else None
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
-        return BodyTrajectory([scan_poses(m.lidars[0]) for m in recordings])
+        """See `Initializer`: by the first LiDAR, or another one that shows all directions far better."""
+        best = leading(recordings) if rig.reference == rig.lidars[0].name else 0
+        reference = rig.lidars[best].name if best else ""
+        return BodyTrajectory([scan_poses(m.lidars[best]) for m in recordings], reference=reference)
 
     def longest_spacing(self, rig: Rig, recordings: Sequence[Measurements], motion: SmoothMotion) -> float:
         """As short as allowed: points are measured at all times, and thousands of them average out noise."""

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.data.measurements import LidarStream
+from icalib.data.measurements import LidarStream, Measurements
 from icalib.detection.planes import count_directions, normal_shares
 from icalib.errors import EstimationError
 from icalib.geometry import so3
@@ -302,6 +302,7 @@ MAX_SAMPLED_POINTS = 6000  # of a scan
 NORMAL_VOXEL_M = 1.0  # edge of the voxels whose normals are counted
 MAX_NORMAL_VOXELS = 1 << 13
 MIN_PLANAR_SCANS = 5  # scans with planar voxels, for a verdict
+CLEARLY_MORE = 4.0  # ratio of shares: the position along the rarest normal is twice as accurate
 DEGENERACIES = {
     1: "face one direction only, such as a floor or parallel walls, so the motion along them is unobservable",
     2: "face two directions only, as in a corridor, so the motion along both is unobservable",
@@ -332,10 +333,27 @@ def degeneracy_error(streams: Sequence[LidarStream]) -> EstimationError | None:
 
 def n_directions(stream: LidarStream) -> int:
     """Number of directions, 1 to 3, that flat surfaces face in most scans; 0 if few scans have flat surfaces."""
+    shares = direction_shares(stream)
+    return 0 if shares is None else count_directions(shares)
+
+
+def direction_shares(stream: LidarStream) -> np.ndarray | None:
+    """Median over scans of `normal_shares` (3,), increasing; None if few scans have flat surfaces."""
     filled = np.flatnonzero(np.diff(stream.start) > 0)
     some = filled[np.linspace(0, len(filled) - 1, min(N_SAMPLED_SCANS, len(filled))).astype(np.int64)]
     shares = [s for i in some if (s := _scan_shares(stream, int(i))) is not None]
-    return count_directions(np.median(shares, axis=0)) if len(shares) >= MIN_PLANAR_SCANS else 0
+    return np.median(shares, axis=0) if len(shares) >= MIN_PLANAR_SCANS else None
+
+
+def leading(recordings: Sequence[Measurements]) -> int:
+    """Index of the LiDAR whose odometry is determined best: the first, unless surfaces of another one face their rarest
+    direction CLEARLY_MORE times as often in the recording that shows it least."""
+    if len(recordings[0].lidars) == 1:
+        return 0
+    shares = [[direction_shares(stream) for stream in m.lidars] for m in recordings]
+    least = np.min([[0.0 if s is None else s[0] for s in row] for row in shares], axis=0)
+    best = int(np.argmax(least))
+    return best if least[best] > CLEARLY_MORE * least[0] else 0
 
 
 def _scan_shares(stream: LidarStream, scan: int) -> np.ndarray | None:
