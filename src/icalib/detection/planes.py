@@ -81,7 +81,7 @@ class ExtractedPlanes:
     def of_points(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> np.ndarray:
         """(N,) int32: plane of each of points (N, 3) with sensor positions `origins` (N, 3), in the world frame; -1 for
         none."""
-        return _associate(self.cells, points, origins, search.variance(points, origins), search)[0]
+        return _associate(self.cells, points, origins, search)[0]
 
     def share_seen_through(
         self, points: np.ndarray, origins: np.ndarray, plane: np.ndarray, search: PlaneSearch
@@ -252,22 +252,23 @@ def _packed(patches: list[_Patch], edge_m: float) -> OccupancyGrid:
 
 
 def _associate(
-    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Plane (N,), cell (N,) and distance (N,) m of each point, see `associate`."""
     n = len(points)
     plane, cell, distance = np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n)
-    associate(points, origins, variance, cells, search.gate, search.least_cosine, plane, cell, distance)
+    variances = search.noise_m**2 + search.position_m**2, search.angle_rad**2
+    associate(points, origins, cells, variances, (search.gate, search.least_cosine), plane, cell, distance)
     return plane, cell, distance
 
 
 def _associate_at_once(
-    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, variance: np.ndarray, search: PlaneSearch
+    cells: OccupancyGrid, points: np.ndarray, origins: np.ndarray, search: PlaneSearch
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """As `_associate`, on two threads."""
     halves = (slice(0, len(points) // 2), slice(len(points) // 2, None))
     with ThreadPoolExecutor(len(halves)) as pool:
-        parts = pool.map(lambda h: _associate(cells, points[h], origins[h], variance[h], search), halves)
+        parts = pool.map(lambda h: _associate(cells, points[h], origins[h], search), halves)
         plane, cell, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
     return plane, cell, distance
 
@@ -284,7 +285,7 @@ def _refined(
     small lose their cells; in the `last` round, if the cloud is well registered, uneven ones do, too."""
     patches = sorted(patches, key=lambda p: -p.n_inside)
     cells = _packed(patches, search.voxel_m)
-    plane, cell, distance = _associate_at_once(cells, points, origins, variance, search)
+    plane, cell, distance = _associate_at_once(cells, points, origins, search)
     stats, moments = np.zeros((len(cells.use), 3)), np.zeros((len(patches), MOMENTS))
     sum_cells(points, variance, plane, cell, distance, stats, moments)
     good = (stats[:, 0] >= FEWEST_IN_VOXEL) & (stats[:, 2] < MIXED_CELL_RMS**2 * stats[:, 0])
@@ -464,10 +465,11 @@ def _fill_equations(planes, equation):
 
 
 @njit(cache=True, nogil=True)
-def associate(points, origins, variance, cells, gate, least_cosine, plane, cell, distance):
-    """Associates each point with the plane within `gate` standard deviations that faces the sensor. The plane is -1 if
-    there is none, or if a second plane is near, even one that the beam grazes (the floor at the foot of a far wall).
+def associate(points, origins, cells, variances, limits, plane, cell, distance):
+    """Associates each point with the plane within a gate of standard deviations that faces the sensor. The plane is -1
+    if there is none, or if a second plane is near, even one that the beam grazes (the floor at the foot of a far wall).
     Fills `plane`, `cell` and `distance` of each point. origins (N, 3) m: position of the sensor at each point.
+    variances: of a point [m^2], and of its direction [rad^2]; limits: gate, and least cosine.
 
     The cell is that of the intersection of beam and plane. The measured point would bias the plane by 1.5 mm for small
     faces. Noise along the beam moves points across an edge, or towards another plane, more often in one direction than
@@ -480,8 +482,9 @@ def associate(points, origins, variance, cells, gate, least_cosine, plane, cell,
     for n in range(len(points)):
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         a, b, c = origins[n, 0] - x, origins[n, 1] - y, origins[n, 2] - z
-        far = np.sqrt(a * a + b * b + c * c)
-        reach, least = gate * np.sqrt(variance[n]), least_cosine * far
+        far2 = a * a + b * b + c * c
+        far = np.sqrt(far2)
+        reach, least = limits[0] * np.sqrt(variances[0] + variances[1] * far2), limits[1] * far
         n_hits, q_hit, k_hit, s_hit = 0, -1, -1, 0.0
         for q in range(count):
             r[q] = equation[0, q] * x + equation[1, q] * y + equation[2, q] * z - equation[3, q]

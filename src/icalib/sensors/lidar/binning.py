@@ -19,7 +19,7 @@ so the inner loop works on their coordinates alone and is vectorised.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -165,19 +165,33 @@ def steps_of(bin_s: float) -> int:
     return max(2 * (int(bin_s / BIN_STEP_S + 0.5) // 2) + 1, 1) if bin_s > BIN_STEP_S else 1
 
 
-def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
-    """Points (N, 3) of a LiDAR in the world frame, and positions (N, 3) of the LiDAR at their instants, float32 [m].
+def each_in_world(
+    motion: EstimatedMotion, stream: LidarStream, use: Callable[[slice, np.ndarray, np.ndarray], None]
+) -> None:
+    """Calls `use` for each group of consecutive points, on two threads: with their slice of the stream, the points
+    (n, 3) in the world frame, and positions (n, 3) of the LiDAR at their instants, float32 [m].
 
     Within a step the LiDAR moves with its twist. In gaps of the IMU its motion follows the nearest reading.
     """
-    points, origins = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
 
     def move(group: slice) -> None:
         scans, seconds, range_of_points = _scans_with_steps(stream, stream.plane, BIN_STEP_S, 1, group)
         lidar = sweep(motion, stream.name, instants(stream, motion.state.values, seconds))
-        move_to_world(scans, lidar, BIN_STEP_S, points[range_of_points], origins[range_of_points])
+        points, origins = np.empty_like(scans.xyz), np.empty_like(scans.xyz)
+        move_to_world(scans, lidar, BIN_STEP_S, points, origins)
+        use(range_of_points, points, origins)
 
     in_parallel(move, _scan_groups(stream))
+
+
+def in_world(motion: EstimatedMotion, stream: LidarStream) -> tuple[np.ndarray, np.ndarray]:
+    """All points (N, 3) of a LiDAR in the world frame, and positions (N, 3) of the LiDAR, as in `each_in_world`."""
+    points, origins = np.empty((len(stream.xyz), 3), np.float32), np.empty((len(stream.xyz), 3), np.float32)
+
+    def keep(group: slice, moved: np.ndarray, seen_from: np.ndarray) -> None:
+        points[group], origins[group] = moved, seen_from
+
+    each_in_world(motion, stream, keep)
     return points, origins
 
 

@@ -36,11 +36,12 @@ class LidarStream(Stream):
 
     def some(self, kept: np.ndarray) -> LidarStream:
         """The stream with the points selected by the mask `kept` (N,). All scans stay, even without points."""
-        if kept.all():
-            return self
-        start = np.concatenate([[0], np.cumsum(kept)])[self.start].astype(np.int64)
-        columns = {name: getattr(self, name)[kept] for name in ("offset_s", "xyz", "plane")}
-        return replace(self, start=start, **columns)
+        return self if kept.all() else self.numbered(np.flatnonzero(kept))
+
+    def numbered(self, points: np.ndarray) -> LidarStream:
+        """The stream with the points numbered `points` (n,), increasing. All scans stay, even without points."""
+        columns = {name: getattr(self, name)[points] for name in ("offset_s", "xyz", "plane")}
+        return replace(self, start=np.searchsorted(points, self.start), **columns)
 
     def unassociated(self) -> LidarStream:
         """The stream without known planes."""

@@ -101,9 +101,9 @@ def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.
     stream, plane = inputs.measurements.lidars[index], inputs.association.plane[index]
     points = np.flatnonzero(plane >= 0)
     points = points[:: max(1, -(-len(points) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
-    one = _some_points(stream, points)
+    one = stream.numbered(points)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
-    return _some_points(one, np.flatnonzero(running)), plane[points[running]]
+    return one.numbered(np.flatnonzero(running)), plane[points[running]]
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
@@ -119,13 +119,6 @@ def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarr
             normal = np.linalg.eigh(np.cov(on_plane.T))[1][:, 0]
             out[k] = plane_of(np.copysign(1.0, normal @ values[k, :3]) * normal, centre)
     return out
-
-
-def _some_points(stream: LidarStream, points: np.ndarray) -> LidarStream:
-    """The stream with the points numbered `points` (n,), increasing. Scans without such points stay as empty ones."""
-    start = np.searchsorted(points, stream.start)
-    columns = {name: getattr(stream, name)[points] for name in ("offset_s", "xyz", "plane")}
-    return replace(stream, start=start, **columns)
 
 
 def _seconds_of(stream: LidarStream, state: State) -> np.ndarray:
