@@ -387,20 +387,23 @@ class Observability:
         )
 
 
-def observe(
-    determined: Determined,
-    names: tuple[str, ...],
-    specs: Sequence[ParameterSpec],
-    on_wheels: bool = False,
-    has_target: bool = True,
-    axes: str = "",
-) -> Observability:
-    """Observability from the spread of the data alone.
+@dataclass(frozen=True)
+class Recorded:
+    """What advice on a recording depends on. on_wheels: the rig drives on one of its sensors. has_target: the rig has a
+    target. at_rest: nothing connects the instants, as at stops. axes: text that names the axes about which the rig
+    hardly turned, or empty."""
 
-    names (B,): such as "cam0.translation.x". specs (B,): definition of each column's group. on_wheels: the rig drives
-    on one of its sensors. has_target: the rig has a target. axes: text that names the axes about which the rig hardly
-    turned, or empty.
-    """
+    on_wheels: bool = False
+    has_target: bool = True
+    at_rest: bool = False
+    axes: str = ""
+
+
+def observe(
+    determined: Determined, names: tuple[str, ...], specs: Sequence[ParameterSpec], recorded: Recorded = Recorded()
+) -> Observability:
+    """Observability from the spread of the data alone. names (B,): such as "cam0.translation.x". specs (B,): definition
+    of each column's group."""
     directions = sparse_basis(determined.fixed_directions)
     by_data, by_guess = determined.variances
     spread = np.sqrt(by_data + by_guess) if determined.estimate.outcome.converged else np.full(len(by_data), np.inf)
@@ -408,8 +411,8 @@ def observe(
     for direction in directions.T:
         words, first = _words_of(direction, names)
         spec = specs[first]
-        motion = _missing_motion(spec, on_wheels, has_target).format(axes=axes or EVERY_AXIS)
-        by = "these images" if spec.by_images else "this motion"
+        motion = _missing_motion(spec, recorded).format(axes=recorded.axes or EVERY_AXIS)
+        by = "these images" if spec.by_images else "these places" if recorded.at_rest else "this motion"
         sentences.append(Remark("combination_unobservable", f"{words}: not determined by {by}; {motion}."))
     return Observability(determined.covariance, tuple(sentences), spread, in_null_space(directions), by_guess > by_data)
 
@@ -435,10 +438,14 @@ def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, int]:
     return " with ".join(_words(names[i]) for i in parts), int(order[0])
 
 
-def _missing_motion(spec: ParameterSpec, on_wheels: bool, has_target: bool) -> str:
-    """Text on the motion that would make the parameter observable. It depends on two limits: a rig on wheels cannot
-    turn about every axis, and without a target, points of the scene are tracked."""
-    others = ("" if has_target else spec.motion_without_target, spec.motion_on_wheels if on_wheels else "")
+def _missing_motion(spec: ParameterSpec, recorded: Recorded) -> str:
+    """Text on the motion that would make the parameter observable. It depends on three limits: a rig on wheels cannot
+    turn about every axis, without a target, points of the scene are tracked, and at rest only the target moves."""
+    others = (
+        "" if recorded.has_target else spec.motion_without_target,
+        spec.motion_on_wheels if recorded.on_wheels else "",
+        spec.motion_at_rest if recorded.at_rest else "",
+    )
     return next(filter(None, others), spec.motion)
 
 

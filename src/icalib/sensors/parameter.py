@@ -184,8 +184,8 @@ class ParameterSpec:
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
     explains it. by_images: determined by images, not by motion. motion: advice if the data do not determine the group;
-    {axes} stands for the axes about which the rig hardly turned. motion_on_wheels and motion_without_target replace
-    `motion` for rigs on wheels and without target.
+    {axes} stands for the axes about which the rig hardly turned. motion_on_wheels, motion_without_target and
+    motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing connects the instants.
     """
 
     name: str
@@ -203,6 +203,7 @@ class ParameterSpec:
     motion: str = "move the rig more"
     motion_on_wheels: str = ""
     motion_without_target: str = ""
+    motion_at_rest: str = ""
 
     def in_recordings(self, count: int) -> ParameterSpec:
         """The definition with one number for each of `count` recordings."""

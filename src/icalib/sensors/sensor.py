@@ -16,6 +16,7 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 Sampling = Literal["interval-mean", "instantaneous"]
 Axes = tuple[str, str, str]  # recorded columns that become x, y, z, with signs: ("x", "-y", "-z")
 
+_PLACES = "show the target in more places, tilted about another axis at each"
 ROTATION = ParameterSpec(
     name="rotation",
     size=3,
@@ -26,6 +27,7 @@ ROTATION = ParameterSpec(
     prior_sigma=0.1,
     motion="turn the rig about {axes}",
     motion_on_wheels="drive over ramps: a flat floor does not show tilts; or give it as a prior",
+    motion_at_rest=_PLACES,
 )
 TRANSLATION = ParameterSpec(
     name="translation",
@@ -37,6 +39,7 @@ TRANSLATION = ParameterSpec(
     prior_sigma=0.1,
     motion="turn the rig briskly about {axes}: a lever arm shows only in rotation",
     motion_on_wheels="turn, and drive over ramps: a flat floor does not show heights; or give it as a prior",
+    motion_at_rest=_PLACES,
 )
 TIME_OFFSET = ParameterSpec(
     name="time_offset",
