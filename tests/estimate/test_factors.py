@@ -674,14 +674,15 @@ def board_sample(kind, loss: Loss = "none", curved=False):
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     points = BoardPoints(
         keyframe.astype(float), 3.0 * rng.normal(size=(n, 3)), keyframe, rng.integers(0, 2, n), normal,
-        rng.normal(size=n),
+        rng.normal(size=n), np.ones(n),
     )  # fmt: skip
     noise, sigma = LidarNoise(1.0, 0.0, loss, LOSS_SCALE), rng.uniform(0.5, 2.0, n if kind == ON_BOARDS else n // 2)
     made = BoardFactor("lidar0", kind, points, sigma, noise, bodies, (0,), 4, layout)
-    if kind == ON_BOARDS:  # without grazing beams, whose residuals bend within a step
-        steep = np.abs(made.rows_of_points(slice(None), state, False)[1]) > 0.4
-        points = BoardPoints(*(getattr(points, f.name)[steep] for f in fields(points)))
-        made = replace(made, points=points, sigma=sigma[steep])
+    # without grazing beams, whose residuals bend within a step
+    steep = np.abs(made.rows_of_points(slice(None), state, False)[1]) > 0.4
+    steep = np.repeat(steep.reshape(len(sigma), -1).all(axis=1), made.points_per_row)
+    points = BoardPoints(*(getattr(points, f.name)[steep] for f in fields(points)))
+    made = replace(made, points=points, sigma=sigma[steep[:: made.points_per_row]])
     setup = SimpleNamespace(layout=layout, columns_scale=lambda: np.full(layout.size, 1e-2))
     return row_sample(setup, state, made, loss if curved else "none", curved)
 

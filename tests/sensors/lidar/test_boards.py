@@ -15,7 +15,7 @@ from icalib.geometry import so3
 from icalib.geometry.targets import Checkerboard
 from icalib.pipeline import calibrate_measurements
 from icalib.rig.file import rig_from_dict
-from icalib.sensors.lidar.board_factor import edge_points
+from icalib.sensors.lidar.board_factor import Gate, edge_points
 from icalib.sensors.lidar.initialize.boards import Sheets, pose_by_sheets
 from icalib.tools.simulation.stops import Stops, simulate_stops
 
@@ -77,7 +77,7 @@ def test_rings_cross_the_edges_half_a_step_beyond_the_last_beam():
     _, clouds, boards = cut(stops, 3)
     for cloud, T in zip(clouds, boards, strict=True):
         in_camera = cloud @ stops.T_cam_lidar[:3, :3].T + stops.T_cam_lidar[:3, 3]
-        points, edges = edge_points(cloud, (in_camera - T[:3, 3]) @ T[:3, :3], stops.target.outlines[0], 0.05)
+        points, edges = edge_points(cloud, (in_camera - T[:3, 3]) @ T[:3, :3], Gate(stops.target.outlines[0], 0.05))
         at = (points @ stops.T_cam_lidar[:3, :3].T + stops.T_cam_lidar[:3, 3] - T[:3, 3]) @ T[:3, :3]
         off = (at * edges[:, :3]).sum(axis=1) - edges[:, 3]
         half_step = 0.5 * 2.0 * np.pi / stops.azimuth_steps * np.linalg.norm(points, axis=1)

@@ -43,14 +43,15 @@ POINTS_PER_CHUNK = 150_000  # points of a thread at a time; their entries need 2
 @dataclass(frozen=True)
 class LidarNoise:
     """Noise of a point's distance from its plane. sigma [m]: isotropic part. beam_sigma [m]: range noise along the
-    beam, projected on the normal. loss: robust loss; loss_scale: its scale in standard deviations. edge_sigma [m]: of
-    the middle of a ring on a sheet. inflation: factor on the noise of points on a sheet, whose errors correlate."""
+    beam, projected on the normal. loss: robust loss; loss_scale: its scale in standard deviations. edge_scale: noise of
+    the middle of a ring on a sheet over that of rounding to beams. inflation: factor on the noise of points on a sheet,
+    whose errors correlate."""
 
     sigma: float
     beam_sigma: float = 0.0
     loss: Loss = "none"
     loss_scale: float = 2.5
-    edge_sigma: float = 0.01  # a beam at 3 m is 1 cm wide, and the next one 1 cm away
+    edge_scale: float = 3.0  # before residuals are known: beams are as wide as their steps, and the pose is rough
     inflation: float = 1.0
 
 

@@ -94,7 +94,7 @@ def _on_boards(sensor: Lidar, noise: LidarNoise, factor: BoardFactor, out: White
     and how far errors of the points at a stop correlate."""
     sigma, inflation = factor.noise_sizes(out)
     if factor.kind == ON_EDGES:
-        return replace(noise, edge_sigma=max(inflation * sigma, MIN_RANGE_SIGMA_M))
+        return replace(noise, edge_scale=max(inflation * sigma, 1.0))
     noise = replace(noise, inflation=inflation)
     return noise if sensor.range_noise_m is not None else replace(noise, sigma=max(sigma, MIN_RANGE_SIGMA_M))
 

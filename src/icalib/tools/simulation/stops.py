@@ -37,8 +37,9 @@ def _camera() -> SimCamera:
 @dataclass(frozen=True)
 class Stops:
     """A rig at rest: camera, LiDAR and board. board_angles_deg: largest tilt of the board from facing the camera about
-    each of its axes; distance_m: between camera and board. range_noise_m, range_offset_m: along the beam. room_m: from
-    the camera to the walls. panels: T_cam_panel (n, 4, 4) of flat objects as large as the sheet."""
+    each of its axes; distance_m: between camera and board. azimuth_deg: beams outside return nothing. range_noise_m,
+    range_offset_m: along the beam. bleed_m: beams that miss the sheet by less return its range, too, as from reflective
+    edges. room_m: from the camera to the walls. panels: T_cam_panel (n, 4, 4) of flat objects as large as the sheet."""
 
     n_stops: int = 10
     camera: SimCamera = field(default_factory=_camera)
@@ -49,8 +50,10 @@ class Stops:
     rings: int = 16
     azimuth_steps: int = 1800
     elevation_deg: tuple[float, float] = (-15.0, 15.0)
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
     range_noise_m: float = 0.02
     range_offset_m: float = 0.0
+    bleed_m: float = 0.0
     room_m: float = 5.0
     panels: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
@@ -89,12 +92,16 @@ def _board_pose(stops: Stops, rng: np.random.Generator) -> np.ndarray:
         direction = np.array([*rng.uniform(-0.5, 0.5, 2), 1.0])
         T[:3, 3] = distance * direction / np.linalg.norm(direction) - T[:3, :3] @ middle
         in_camera = stops.target.points @ T[:3, :3].T + T[:3, 3]
-        low, high = np.deg2rad(stops.elevation_deg)
         x, y, z = stops.T_cam_lidar[:3, :3].T @ (T[:3, :3] @ middle + T[:3, 3] - stops.T_cam_lidar[:3, 3])
-        if visible(stops.camera, in_camera, project(stops.camera, in_camera)).all() and (
-            low < np.arctan2(z, np.hypot(x, y)) < high
-        ):
+        looked_at = _between(np.arctan2(z, np.hypot(x, y)), stops.elevation_deg)
+        looked_at &= _between(np.arctan2(y, x), stops.azimuth_deg)
+        if looked_at and visible(stops.camera, in_camera, project(stops.camera, in_camera)).all():
             return T
+
+
+def _between(angle: np.ndarray, limits_deg: tuple[float, float]) -> np.ndarray:
+    low, high = np.deg2rad(limits_deg)
+    return (angle > low) & (angle < high)
 
 
 def _corners(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -105,7 +112,8 @@ def _corners(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) ->
 
 def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(N, 3) measured points in the frame of the LiDAR: each beam ends at the board, a panel or a wall."""
-    azimuth = 2.0 * np.pi * np.arange(stops.azimuth_steps)[:, None] / stops.azimuth_steps
+    azimuth = np.pi * (2.0 * np.arange(stops.azimuth_steps)[:, None] / stops.azimuth_steps - 1.0)
+    azimuth = azimuth[_between(azimuth[:, 0], stops.azimuth_deg)]
     elevation = np.deg2rad(np.linspace(*stops.elevation_deg, stops.rings))
     axes = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation) + 0.0 * azimuth
     beams = np.stack(axes, axis=2).reshape(-1, 3)
@@ -113,8 +121,9 @@ def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> n
     rays = beams @ R.T
     ahead = np.where(rays > 0.0, 1.0, -1.0) * stops.room_m - origin
     distance = (ahead / np.where(rays == 0.0, -1e-12, rays)).min(axis=1)
+    outline = stops.target.outlines[0] + stops.bleed_m * np.array([[-1.0], [1.0]])
     for T in (T_cam_board, *stops.panels):
-        distance = np.minimum(distance, _to_sheet(T, stops.target.outlines[0], origin, rays))
+        distance = np.minimum(distance, _to_sheet(T, outline, origin, rays))
     measured = distance + stops.range_offset_m + stops.range_noise_m * rng.standard_normal(len(distance))
     return beams * measured[:, None]
 

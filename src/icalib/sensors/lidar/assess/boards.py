@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,10 +12,11 @@ from icalib.observability.assessor import AssessedEstimate, Assessment
 from icalib.optim.state import State
 from icalib.result.calibration import Plane
 from icalib.rig import ParameterSpec
-from icalib.sensors.lidar.board_factor import ON_BOARDS, ON_EDGES, BoardFactor, in_scene
+from icalib.sensors.lidar.board_factor import GATE_SIGMAS, ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints, in_scene
 from icalib.sensors.lidar.spec import RANGE_OFFSET
 from icalib.sensors.lidar.stream import LidarResiduals, LidarStream
 
+SEARCHED_SHARE = 0.5  # of the sheet's shorter side: edges of sheets of another size are looked for so far from theirs
 WIDEST_BEAM_M = 0.025  # edges that wide beams shift by more are those of a larger sheet
 SIGNIFICANT_SIGMAS = 2.0  # of a range offset: one in 20 by chance
 
@@ -90,9 +92,15 @@ def _notes(a: AssessedEstimate) -> Iterator[Remark]:
 
 def _wrong_sheets(a: AssessedEstimate) -> Iterator[Remark]:
     """Warnings on edges of sheets that are elsewhere than `sheet` in the rig file says."""
-    for f in _factors(a, ON_EDGES):
-        off = f.rows_of_points(slice(None), a.estimate.outcome.state, False)[0].residual
-        growth = float(np.median(off))
+    state, bodies = a.estimate.outcome.state, a.inputs.bodies
+    for f in _factors(a):
+        stream = a.inputs.measurements.streams[f.name]
+        assert isinstance(stream, LidarStream)
+        sides = np.diff(bodies.target.outlines[list(bodies.used)], axis=1)
+        off_m = GATE_SIGMAS * float(np.hypot(f.noise.sigma, f.noise.beam_sigma))
+        _, edges = BoardPoints.of(stream, bodies, state, off_m, SEARCHED_SHARE * float(sides.min()))
+        off = replace(f, kind=ON_EDGES, points=edges).rows_of_points(slice(None), state, False)[0].residual
+        growth = float(np.median(off)) if len(off) else 0.0
         if abs(growth) > WIDEST_BEAM_M:
             yield Remark(
                 "sheet_size_wrong",
