@@ -1,6 +1,6 @@
 """Are standard deviations as large as errors? NEES of many short simulated recordings, by kind of sensor.
 
-python benchmarks/nees.py [--first-seed N] [--rounds N] [--without-imu MINUTES] [--imus]
+python benchmarks/nees.py [--first-seed N] [--rounds N] [--without-imu MINUTES] [--imus] [--boards N]
 
 A round is what tests/consistency/test_sigmas.py runs, with other seeds. The mean normalised estimation error squared
 (NEES) per degree of freedom is printed, and the bounds within which it is where standard deviations are honest.
@@ -11,6 +11,8 @@ NEES is that of the wheels' radii and baseline.
 
 With --imus, rigs of two and three IMUs, from nothing, 40 s each, 30 seeds: beside a camera and a board, and alone. The
 root mean square of each error is printed, too.
+
+With --boards, a camera and a LiDAR at rest and a board in ten places, N seeds for each number of rings; and in three.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from pathlib import Path
 
 import numpy as np
 
+from icalib.geometry import so3
 from icalib.geometry.targets import AprilGrid
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import PoseSensor, Rig
@@ -35,12 +38,14 @@ from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
 from icalib.tools.simulation.motion import rotation_from_vector
+from icalib.tools.simulation.stops import Stops, simulate_stops
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 WALL_GRID = AprilGrid(4, 10, 0.6, 0.3)
 ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
 FALSE_ALARMS = 1e-3  # in a round, where standard deviations are honest
 TOGETHER = "all"
+PARTS = slice(0, 3), slice(3, 6)  # rotation and translation in a vector of errors
 LEAST_DOF = 400  # for sigmas 1.3 times too small or too large to be beyond chance
 
 
@@ -234,6 +239,27 @@ def check_imus(seeds: range) -> int:
     return failed
 
 
+def check_boards(seeds: range) -> int:
+    """Prints NEES and errors of LiDARs at rest. Returns the number of checks that failed."""
+    failed = 0
+    for stops in (Stops(10), Stops(10, rings=64), Stops(3)):
+        samples, T = [], stops.T_cam_lidar
+        for seed in seeds:
+            result = calibrate_measurements(stops.rig(), simulate_stops(stops, seed)[0])
+            rotation, translation = (result.group("lidar0", name) for name in ("rotation", "translation"))
+            turn = so3.log(np.ascontiguousarray(T[:3, :3].T @ rotation.value))
+            error = np.append(turn, translation.value - T[:3, 3])
+            assert rotation.columns is not None and translation.columns is not None
+            columns = np.append(rotation.columns, translation.columns)
+            samples.append(Sample(seed, error, result.covariance[np.ix_(columns, columns)]))
+        found = nees(samples, 0.99)
+        turns, shifts = (np.sqrt((np.array([s.error[k] for s in samples]) ** 2).sum(axis=1).mean()) for k in PARTS)
+        print(f"{stops.n_stops} places, {stops.rings} rings: RMS {np.rad2deg(turns):.3f} deg, {1e3 * shifts:.1f} mm")
+        print(f"  NEES {found.mean:.2f}, bounds {found.low:.2f} to {found.high:.2f}", flush=True)
+        failed += not found.consistent
+    return failed
+
+
 def scenarios_without_imu(seconds: float) -> dict[str, Scenario]:
     """A vehicle on ramps, its wheels beside motion capture or beside a camera that sees a wall of tags."""
     scenario = load_scenario(PAPER / "table2-ramp.yaml")
@@ -289,7 +315,10 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=1)
     parser.add_argument("--without-imu", type=float, metavar="MINUTES")
     parser.add_argument("--imus", action="store_true")
+    parser.add_argument("--boards", type=int, metavar="N")
     options = parser.parse_args()
+    if options.boards:
+        return min(check_boards(range(options.first_seed, options.first_seed + options.boards)), 1)
     if options.imus:
         return min(check_imus(range(options.first_seed, options.first_seed + 30)), 1)
     if options.without_imu is not None:

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 from tests.cases import each
 
-from icalib.observability.determination import Observability, Recorded, observe, sparse_basis
+from icalib.observability.determination import Observability, RecordingTraits, observe, sparse_basis
 from icalib.result import Verdict
 from icalib.rig import ParameterSpec
 from icalib.rig.rig import ALL_SPECS
@@ -60,7 +60,7 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
         found = shared(50.0)
         found.fixed_directions = fixed_directions / np.linalg.norm(fixed_directions)
         found.variances, found.covariance = (np.zeros(3), np.full(3, 2500.0)), np.eye(3)
-        (sentence,) = observe(found, names, specs_of(names), Recorded(on_wheels=True)).unobservable
+        (sentence,) = observe(found, names, specs_of(names), RecordingTraits(on_wheels=True)).unobservable
         assert sentence.startswith("left_cam translation z with wheel0 baseline: not determined by this motion; ")
     found.fixed_directions = np.array([0.0, 1.0, 0.0])[:, None]
     assert observe(found, names, specs_of(names)).unobservable[0].startswith("left_cam time offset: ")
@@ -69,11 +69,19 @@ def test_names_stand_in_the_order_of_the_rig_and_say_nothing_twice():
 @each(
     ("parameter", "recorded", "advice"),
     [
-        ("cam0.distortion.k1", Recorded(), "by these images; show the target in the corners of the image"),
-        ("cam0.distortion.k1", Recorded(has_target=False), "points of the scene pass through the corners of the image"),
-        ("cam0.translation.x", Recorded(has_target=False), "this motion; turn the rig briskly about every axis"),
-        ("cam0.translation.x", Recorded(at_rest=True), "by these places; show the target in more places, tilted"),
-        ("wheel0.translation.z", Recorded(on_wheels=True, has_target=False), "turn, and drive over ramps"),
+        ("cam0.distortion.k1", RecordingTraits(), "by these images; show the target in the corners of the image"),
+        (
+            "cam0.distortion.k1",
+            RecordingTraits(has_target=False),
+            "points of the scene pass through the corners of the image",
+        ),
+        ("cam0.translation.x", RecordingTraits(has_target=False), "this motion; turn the rig briskly about every axis"),
+        (
+            "cam0.translation.x",
+            RecordingTraits(at_rest=True),
+            "by these places; show the target in more places, tilted",
+        ),
+        ("wheel0.translation.z", RecordingTraits(on_wheels=True, has_target=False), "turn, and drive over ramps"),
     ],
 )
 def test_the_missing_motion_is_that_of_the_sensor(parameter, recorded, advice):

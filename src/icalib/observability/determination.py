@@ -388,7 +388,7 @@ class Observability:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordingTraits:
     """What advice on a recording depends on. on_wheels: the rig drives on one of its sensors. has_target: the rig has a
     target. at_rest: nothing connects the instants, as at stops. axes: text that names the axes about which the rig
     hardly turned, or empty."""
@@ -400,7 +400,10 @@ class Recorded:
 
 
 def observe(
-    determined: Determined, names: tuple[str, ...], specs: Sequence[ParameterSpec], recorded: Recorded = Recorded()
+    determined: Determined,
+    names: tuple[str, ...],
+    specs: Sequence[ParameterSpec],
+    traits: RecordingTraits = RecordingTraits(),
 ) -> Observability:
     """Observability from the spread of the data alone. names (B,): such as "cam0.translation.x". specs (B,): definition
     of each column's group."""
@@ -411,8 +414,8 @@ def observe(
     for direction in directions.T:
         words, first = _words_of(direction, names)
         spec = specs[first]
-        motion = _missing_motion(spec, recorded).format(axes=recorded.axes or EVERY_AXIS)
-        by = "these images" if spec.by_images else "these places" if recorded.at_rest else "this motion"
+        motion = _missing_motion(spec, traits).format(axes=traits.axes or EVERY_AXIS)
+        by = "these images" if spec.by_images else "these places" if traits.at_rest else "this motion"
         sentences.append(Remark("combination_unobservable", f"{words}: not determined by {by}; {motion}."))
     return Observability(determined.covariance, tuple(sentences), spread, in_null_space(directions), by_guess > by_data)
 
@@ -438,13 +441,13 @@ def _words_of(direction: np.ndarray, names: tuple[str, ...]) -> tuple[str, int]:
     return " with ".join(_words(names[i]) for i in parts), int(order[0])
 
 
-def _missing_motion(spec: ParameterSpec, recorded: Recorded) -> str:
+def _missing_motion(spec: ParameterSpec, traits: RecordingTraits) -> str:
     """Text on the motion that would make the parameter observable. It depends on three limits: a rig on wheels cannot
     turn about every axis, without a target, points of the scene are tracked, and at rest only the target moves."""
     others = (
-        "" if recorded.has_target else spec.motion_without_target,
-        spec.motion_on_wheels if recorded.on_wheels else "",
-        spec.motion_at_rest if recorded.at_rest else "",
+        "" if traits.has_target else spec.motion_without_target,
+        spec.motion_on_wheels if traits.on_wheels else "",
+        spec.motion_at_rest if traits.at_rest else "",
     )
     return next(filter(None, others), spec.motion)
 

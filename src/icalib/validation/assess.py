@@ -29,7 +29,7 @@ from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
 from icalib.observability.assessor import AssessedEstimate, assessments
 from icalib.observability.contradictions import Contradiction
-from icalib.observability.determination import Determined, Observability, Recorded, observe
+from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
@@ -118,8 +118,8 @@ def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) ->
     state = determined.estimate.outcome.state
     axes = hardly_turned(state.seconds, state.rotation, inputs.rig.reference)
     on_wheels = any(s.drives for s in inputs.rig.mounted)
-    recorded = Recorded(on_wheels, inputs.rig.has_target, inputs.imu is None, axes)
-    return observe(determined, names, _column_specs(inputs), recorded)
+    traits = RecordingTraits(on_wheels, inputs.rig.has_target, inputs.imu is None, axes)
+    return observe(determined, names, _column_specs(inputs), traits)
 
 
 def _notes(assessed: AssessedEstimate) -> Iterator[Remark]:

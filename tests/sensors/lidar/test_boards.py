@@ -42,10 +42,13 @@ def alike(number: int) -> np.ndarray:
     return panels
 
 
+# T_board_panel of an object as large as the sheet, 1.2 m to its right
+BESIDE = np.eye(4)[None] + np.array([[0.0, 0.0, 0.0, 1.2], *np.zeros((3, 4))])
 CASES = {
     "16 rings": Stops(6),
     "64 rings": Stops(4, rings=64),
     "two objects alike that stay": Stops(6, panels=alike(2)),
+    "a second board carried beside it": Stops(4, carried=BESIDE, elevation_deg=(-25.0, 15.0)),
     "a LiDAR mounted upside down": Stops(6, T_cam_lidar=Stops().T_cam_lidar @ np.diag([1.0, -1.0, -1.0, 1.0])),
     "ranges 5 cm too long": Stops(6, range_offset_m=0.05),
 }
@@ -63,13 +66,21 @@ def test_the_board_is_found_from_nothing(case):
     assert np.linalg.norm(pose.p - stops.T_cam_lidar[:3, 3]) < 0.02 + 1.2 * stops.range_offset_m
 
 
-def test_clouds_without_the_board_are_refused():
-    stops = Stops(4)
+SMALL = replace(Stops(4), target=Checkerboard(2, 2, 0.01, sheet=(0.02, 0.02)))
+REFUSED = {
+    "no board in the clouds": (SMALL, "the target was not found in its 4 clouds: no flat object of 0.70 x 0.85 m"),
+    "two stops": (Stops(2), "clouds of 2 stops at which the cameras see the target are too few, at least 3 are needed"),
+}
+
+
+@each("case", REFUSED)
+def test_clouds_that_do_not_show_one_board_are_refused(case):
+    scanned, sentence = REFUSED[case]
+    stops = Stops(scanned.n_stops)
     measured, _ = simulate_stops(stops, 2)
-    elsewhere, _ = simulate_stops(replace(stops, target=Checkerboard(2, 2, 0.01, sheet=(0.02, 0.02))), 2)
-    without = measured.with_streams(elsewhere.lidars[0])
-    with pytest.raises(EstimationError, match="the target was not found in its 4 clouds: no flat object"):
-        calibrate_measurements(stops.rig(), without)
+    clouds, _ = simulate_stops(scanned, 2)
+    with pytest.raises(EstimationError, match=sentence):
+        calibrate_measurements(stops.rig(), measured.with_streams(clouds.lidars[0]))
 
 
 def test_rings_cross_the_edges_half_a_step_beyond_the_last_beam():
@@ -88,10 +99,11 @@ def test_rings_cross_the_edges_half_a_step_beyond_the_last_beam():
         assert np.abs(at[:, 2]).max() < 1e-3
 
 
-def errors(stops: Stops, seed: int):
-    """Errors (6,) of rotation [rad] and translation [m], and their covariance (6, 6)."""
+def errors(stops: Stops, seed: int, sheet: tuple[float, float] = (0.7, 0.85)):
+    """Errors (6,) of rotation [rad] and translation [m], and their covariance (6, 6). sheet: as the rig file has it."""
     measured, _ = simulate_stops(stops, seed)
-    result = calibrate_measurements(stops.rig(), measured)
+    rig = stops.rig()
+    result = calibrate_measurements(rig.with_(target=replace(rig.target, sheet=sheet)), measured)
     rotation, translation = result.group("lidar0", "rotation"), result.group("lidar0", "translation")
     turn = so3.log(np.ascontiguousarray(stops.T_cam_lidar[:3, :3].T @ rotation.value))
     columns = [*not_none(rotation.columns), *not_none(translation.columns)]
@@ -109,6 +121,31 @@ def test_ten_places_of_a_board():
     offset = result.group("lidar0", "range_offset")
     assert abs(offset.value[0] - 0.03) < 4.0 * offset.std[0]
     assert {"lidar_points_on_target", "ranges_offset"} <= set(names(result.notes))
+
+
+DISTURBED = {
+    "a sheet 10 cm smaller than stated": (Stops(6), (0.8, 0.95), "mm farther in than `sheet`"),
+    "edges that bleed": (Stops(6, bleed_m=0.03), (0.7, 0.85), "says, or bright edges bleed"),
+    "boards cut by the field of view": (Stops(6, azimuth_deg=(-12.0, 12.0)), (0.7, 0.85), ""),
+}
+
+
+@pytest.mark.slow
+@each("case", DISTURBED)
+def test_disturbed_edges_are_named_and_do_no_harm(case):
+    stops, sheet, sentence = DISTURBED[case]
+    error, covariance, result = errors(stops, 1, sheet)
+    assert error @ np.linalg.solve(covariance, error) < 22.5  # chi^2 of 6 at 99.9 %
+    assert np.rad2deg(np.linalg.norm(error[:3])) < 0.3 and np.linalg.norm(error[3:]) < 0.02
+    said = [w for w in result.warnings if w.name == "sheet_size_wrong"]
+    assert [sentence in w for w in said] == [True] * bool(sentence)
+
+
+@pytest.mark.slow
+def test_boards_that_turn_about_one_axis_do_not_show_all():
+    _, _, result = errors(Stops(4, board_angles_deg=(0.0, 40.0, 0.0)), 1)
+    (sentence,) = result.unobservable
+    assert sentence.startswith("lidar0 translation y: not determined by these places; show the target in more places")
 
 
 BAD_SHEETS = {

@@ -39,7 +39,8 @@ class Stops:
     """A rig at rest: camera, LiDAR and board. board_angles_deg: largest tilt of the board from facing the camera about
     each of its axes; distance_m: between camera and board. azimuth_deg: beams outside return nothing. range_noise_m,
     range_offset_m: along the beam. bleed_m: beams that miss the sheet by less return its range, too, as from reflective
-    edges. room_m: from the camera to the walls. panels: T_cam_panel (n, 4, 4) of flat objects as large as the sheet."""
+    edges. room_m: from the camera to the walls. panels: T_cam_panel (n, 4, 4) of flat objects as large as the sheet;
+    carried: T_board_panel (n, 4, 4) of such objects that move with the board."""
 
     n_stops: int = 10
     camera: SimCamera = field(default_factory=_camera)
@@ -56,6 +57,7 @@ class Stops:
     bleed_m: float = 0.0
     room_m: float = 5.0
     panels: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    carried: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
 
     def rig(self, knows_lens: bool = True) -> Rig:
         """The rig that a user would write, without any true value but, if `knows_lens`, those of the lens."""
@@ -122,7 +124,7 @@ def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> n
     ahead = np.where(rays > 0.0, 1.0, -1.0) * stops.room_m - origin
     distance = (ahead / np.where(rays == 0.0, -1e-12, rays)).min(axis=1)
     outline = stops.target.outlines[0] + stops.bleed_m * np.array([[-1.0], [1.0]])
-    for T in (T_cam_board, *stops.panels):
+    for T in (T_cam_board, *stops.panels, *(T_cam_board @ stops.carried)):
         distance = np.minimum(distance, _to_sheet(T, outline, origin, rays))
     measured = distance + stops.range_offset_m + stops.range_noise_m * rng.standard_normal(len(distance))
     return beams * measured[:, None]

@@ -105,8 +105,8 @@ def _wrong_sheets(a: AssessedEstimate) -> Iterator[Remark]:
             yield Remark(
                 "sheet_size_wrong",
                 f"{f.name} sees the edges of the target {1e3 * abs(growth):.0f} mm farther "
-                f"{'out' if growth > 0.0 else 'in'} than `sheet` in the rig file says; measure the sheet again, or "
-                "leave `sheet` out.",
+                f"{'out' if growth > 0.0 else 'in'} than `sheet` in the rig file says"
+                f"{', or bright edges bleed' if growth > 0.0 else ''}; measure the sheet again, or leave `sheet` out.",
             )
 
 
