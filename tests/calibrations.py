@@ -181,14 +181,20 @@ def _null_space(names: tuple[str, ...]) -> np.ndarray:
     return np.eye(len(names))[:, [names.index("cam1.translation.y")]]
 
 
-def _trajectory() -> Trajectory:
-    t = 0.05 * np.arange(N_KEYFRAMES)
+def pose_at(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R_world_body (n, 3, 3) and p_world_body (n, 3) at t (n,) s."""
     angles = np.stack([0.5 * np.sin(2.1 * t), 0.4 * np.sin(1.7 * t + 1), 0.6 * np.sin(1.3 * t)], axis=1)
     position = np.stack([0.4 + 0.3 * np.sin(1.9 * t), 0.2 * np.cos(1.6 * t) - 1.2, 0.3 + 0.2 * np.sin(2.3 * t)], axis=1)
     facing = Rotation.from_matrix(np.array([[0, -1, 0], [0, 0, 1], [-1, 0, 0]]).T[[2, 0, 1]])
+    return (facing * Rotation.from_rotvec(angles)).as_matrix(), position
+
+
+def _trajectory() -> Trajectory:
+    t = 0.05 * np.arange(N_KEYFRAMES)
+    rotation, position = pose_at(t)
     return Trajectory(
         seconds=t,
-        rotation=(facing * Rotation.from_rotvec(angles)).as_matrix(),
+        rotation=rotation,
         position=position,
         velocity=np.gradient(position, t, axis=0),
         gyro_bias=1e-3 * np.stack([np.cos(0.1 * t), np.sin(0.1 * t), 0.1 * t], axis=1),

@@ -24,6 +24,7 @@ from icalib.kinds import readers
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
 from icalib.result.calibration import provenance
+from icalib.result.pictures import pictures
 from icalib.rig import Rig
 from icalib.rig.file import check_complete, load_rig
 from icalib.validation import assess, stated_words, visited
@@ -165,6 +166,8 @@ def _calibrate(
     progress("assessing the result", 0.9)
     result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
     _refuse_no_numbers(result, rig)
+    lidars = [s.name for s in rig.sensors.values() if s.shows_planes]
+    result = dataclasses.replace(result, pictures=tuple(pictures(result, lidars, recordings)))
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps, made=datetime.now(UTC).isoformat(timespec="seconds"))
 

@@ -16,6 +16,7 @@ import yaml
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 from tests.remarks import remark
+from tests.report.test_pictures import with_images
 
 from icalib.export.formats import check_folder, write_outputs
 from icalib.report import report_html
@@ -431,5 +432,5 @@ def test_outputs_are_one_set(calibration: Calibration, tmp_path: Path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
 
 
-def test_a_browser_draws_it(text: str, assert_drawn: Callable[[str, set[str]], None]):
-    assert_drawn(text, FIGURES)
+def test_a_browser_draws_it(calibration: Calibration, assert_drawn: Callable[[str, set[str]], None]):
+    assert_drawn(report_html(with_images(calibration)), FIGURES)

@@ -128,6 +128,7 @@ def _add_calibrate(commands: argparse._SubParsersAction[CommandParser]) -> None:
     )
     strict = "exit code 3: usable with care, 4: partly usable, 5: not usable; default: 0 for every written result"
     c.add_argument("--strict", action="store_true", help=strict)
+    c.add_argument("--no-images", action="store_true", help="leave recorded images out of the report")
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table; warnings go to stderr")
     c.add_argument("--verbose", "-v", action="store_true", help="print single numbers of lenses, IMU and board, too")
     c.set_defaults(run=_calibrate)
@@ -238,6 +239,8 @@ def _calibrate(options: argparse.Namespace) -> int:
     chosen = {k: getattr(options, k) for k in ("scheme", "loss", "segments") if getattr(options, k) is not None}
     if chosen.get("segments", 0) < 0 or chosen.get("segments") == 1:
         raise CalibrationError("--segments must be 0 (none) or at least 2 segments.")
+    if options.no_images:
+        chosen["images_in_report"] = False
     rig = dataclasses.replace(rig, settings=dataclasses.replace(rig.settings, **chosen))
     check_folder(options.output, [options.rig, *options.recording])
     with console_progress(options.quiet) as progress:

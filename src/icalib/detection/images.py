@@ -83,6 +83,46 @@ def words_on_damaged(damaged_ns: Sequence[int], files: Mapping[int, str]) -> tup
     return (Remark("images_damaged", f"{len(damaged_ns)} damaged images were ignored, the first {first}."),)
 
 
+# Images that a report shows. They are taken while the stream is read, as nobody reads it again for them.
+
+MOST_PICTURES = 64  # of a camera: 6.4 MB at most; the worst of them is the 98th percentile of a long recording
+PICTURE_SIZE, PICTURE_QUALITY = 800, 60  # px of the longer side, and percent of JPEG: some 50 kB each
+MOST_BYTES = 100_000  # of a picture, which bounds the report; only noise all over the image has more, and is shrunk
+
+
+class SeenImages:
+    """Notes on the images of a stream that is read. files: name of the file of each by stamp, "" if it is from no file.
+    pictures: the same name and a small JPEG, by stamp, of at most `most` images evenly spread over about `count`."""
+
+    def __init__(self, count: int, most: int) -> None:
+        self.files: dict[int, str] = {}
+        self.pictures: dict[int, tuple[str, bytes]] = {}
+        self._every, self._most = max(1, ceil(count / max(most, 1))), most
+
+    def add(self, payload: Payload) -> None:
+        """Notes an image, unless the stream is read once more."""
+        if payload.stamp_ns in self.files:
+            return
+        if self._most and len(self.files) % self._every == 0:
+            with suppress(DamagedImageError):
+                self.pictures[payload.stamp_ns] = payload.name, _small_jpeg(decode(payload))
+        self.files[payload.stamp_ns] = payload.name
+        if len(self.pictures) > self._most:
+            self.pictures = dict(list(self.pictures.items())[::2])
+            self._every *= 2
+
+
+def _small_jpeg(image: np.ndarray) -> bytes:
+    cv2 = load_cv2()
+    share, jpeg = min(1.0, PICTURE_SIZE / max(image.shape)), b""
+    while not jpeg or len(jpeg) > MOST_BYTES:
+        width, height = (max(1, round(share * side)) for side in reversed(image.shape))
+        small = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, PICTURE_QUALITY])[1].tobytes()
+        share *= 0.7
+    return jpeg
+
+
 def core_count() -> int:
     """Number of processor cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -13,8 +13,9 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
+from icalib.detection.images import MOST_PICTURES
 from icalib.kinds import presenters
-from icalib.report import rig_figures
+from icalib.report import pictures, rig_figures
 from icalib.report.figures import (
     Figure,
     ResidualCloud,
@@ -79,6 +80,19 @@ _NO_CROSS_VALIDATION = (
 )
 
 
+_PICTURE_WORDS = (
+    f"Up to {MOST_PICTURES} images of each camera, evenly spread, were kept while the recording was read; the median "
+    "and the worst of them are shown. Green squares are measured points, red crosses rejected ones. Yellow lines, "
+    "magnified, lead to where the calibration projects the point. Lines of a good fit have no common direction."
+)
+_POINTS_WORDS = (
+    "Points of a LiDAR are where the calibration projects them; the trajectory moves each from its own instant to that "
+    "of the image. The magenta line is the outline of the target in the pose that the camera sees. In a good "
+    "calibration colours change at the edges of objects. A wrong rotation shifts points in all images, a wrong time "
+    "offset in those of fast turns. Points that an object hides from the camera are drawn, too."
+)
+
+
 def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
@@ -98,6 +112,7 @@ def report_html(calibration: Calibration) -> str:
         "trust": trust(c),
         "cards": sensor_cards(c),
         "pairs": camera_pairs(c),
+        "pictures": _pictures(c),
         "reasons": reasons(c),
         "notes": sentences(c.notes, "", "None."),
         "fits": fits(c),
@@ -112,6 +127,17 @@ def report_html(calibration: Calibration) -> str:
     body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
     figures = {name: drawn for section in about_sensors for name, drawn in section.figures.items()}
     return document(f"Calibration of {words['sensors']}", body, _figures(c) | figures)
+
+
+def _pictures(c: Calibration) -> Html:
+    """Section with recorded images and what was found in them; empty without images."""
+    shots = [element("figure", [Html(svg), element("figcaption", text)]) for svg, text in pictures.figures(c)]
+    if not shots:
+        return Html("")
+    has_points = any(picture.after is not None for picture in c.pictures)
+    text = f"{_PICTURE_WORDS} {_POINTS_WORDS if has_points else ''}".rstrip()
+    parts = [element("h2", "What the sensors saw"), element("p", text), element("div", shots, "shots")]
+    return Html(f'<section id="pictures">{html(parts)}</section>')
 
 
 def _ellipsoid_words(c: Calibration) -> str:

@@ -25,6 +25,7 @@ from icalib.report.figures import (
     y_of,
 )
 from icalib.result import Calibration, joint_covariance
+from icalib.result.pictures import scene_in_worlds
 from icalib.result.verdict import worst
 
 # Figures of the rig in 3D, and of the correlation of its parameters.
@@ -130,13 +131,6 @@ def body_outline(target: Target, body: int) -> np.ndarray:
     (x0, y0, _), (x, y, _) = (f(target.points[target.body == body], axis=0) for f in (np.min, np.max))
     corners = np.array([(x0, y0, 0.0), (x, y0, 0.0), (x, y, 0.0), (x0, y, 0.0), (x0, y0, 0.0)])
     return np.vstack([corners, PEN_UP])
-
-
-def scene_in_worlds(c: Calibration) -> list[tuple[str, np.ndarray]]:
-    """Name of the target's scene and R_world_scene (3, 3), by recording. Without an IMU scene and world frame are
-    equal. Empty if there is an IMU and the target was never observed."""
-    tilts = [(g.sensor, g.value) for g in c.groups if g.name == "tilt"]
-    return tilts or ([("board0", np.eye(3))] if c.imu is None else [])
 
 
 # Ellipsoids of the position uncertainty of each sensor, for the report and the 3D view.

@@ -127,6 +127,35 @@ class Visited:
 
 
 @dataclass(frozen=True)
+class PointsInImage:
+    """Points of a LiDAR in an image: uv (n, 2) px, distance (n,) m from the camera."""
+
+    uv: np.ndarray
+    distance: np.ndarray
+
+
+@dataclass(frozen=True)
+class ReportImage:
+    """An image of a camera, recorded at `seconds` of the result, for the report.
+
+    title: why it was chosen. jpeg: the whole image, of any size. outline (n, 2) px: of the target; a row of NaN
+    separates two lines. file: name of the image, where it tells more than the instant, at a stop. after: points of the
+    LiDAR `sensor`; before: the same by the extrinsics and time offsets of the first guess, None if unknown. Both are
+    None, and `sensor` is empty, in pictures of the camera alone.
+    """
+
+    camera: str
+    seconds: float
+    title: str
+    jpeg: bytes
+    outline: np.ndarray
+    file: str = ""
+    sensor: str = ""
+    before: PointsInImage | None = None
+    after: PointsInImage | None = None
+
+
+@dataclass(frozen=True)
 class Calibration:
     """Everything that a run estimated, and the inputs that it used."""
 
@@ -154,6 +183,10 @@ class Calibration:
     planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
     cross_validation: CrossValidation | None = None  # None if the recording could not be split
     wrong: tuple[Remark, ...] = ()  # those of `warnings` that show an error in the rig file or the recording
+    # Known only where the calibration is made, not where it is loaded: rotation, translation and time offset of each
+    # sensor in the first guess, if a LiDAR is in the rig; and pictures for the report.
+    first_guess: Mapping[tuple[str, str], np.ndarray] = field(default_factory=dict)
+    pictures: tuple[ReportImage, ...] = ()
 
     def residuals_of(self, *kinds: str) -> tuple[Any, ...]:
         """Residual records of these kinds of measurement ("corners", "points", ...), in the order of `kinds`."""

@@ -46,6 +46,7 @@ class Settings:
     blur_noise: bool = True  # corner sigma grows with image speed (motion blur)
     common_error: bool = False  # corners of an image share a random shift; its sigma is estimated
     cache_corners: bool = True  # cache detected corners in the user's cache folder
+    images_in_report: bool = True  # show a few recorded images in the report
     segments: int = 8  # number for the block jackknife (empirical factor); 0: no jackknife
     max_gap_s: float = 0.5  # IMU gaps up to this are bridged; longer ones split the recording
     keyframe_spacing_s: float = 0.05  # longest interval between consecutive keyframes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, NamedTuple, Protocol, Self, TypeVar
 
@@ -75,7 +75,8 @@ class RawReadings:
 @dataclass(frozen=True)
 class Stream:
     """Checked measurements of one sensor. name: name of the sensor; stamps_ns (N,) int64 [ns] on the sensor's clock;
-    joins_ns: if several recordings were joined, the first stamp of each except the first.
+    joins_ns: if several recordings were joined, the first stamp of each except the first. pictures: a few images of the
+    sensor by stamp, to show in a report, each the name of its file ("": none) and a JPEG of any size.
 
     Subclasses add arrays with N rows. Subclasses with `start` (N + 1,) have rows start[i]:start[i + 1] for stamp i. An
     array with 0 rows means that the sensor does not report it. Raises RecordingError for inconsistent shapes.
@@ -85,6 +86,7 @@ class Stream:
     name: str
     stamps_ns: np.ndarray
     joins_ns: tuple[int, ...] = field(default=(), kw_only=True)
+    pictures: Mapping[int, tuple[str, bytes]] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
         check(self.stamps_ns.dtype == np.int64, f"{self.name}: stamps must be int64 nanoseconds.")

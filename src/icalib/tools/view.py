@@ -10,9 +10,10 @@ import os
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import islice
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,20 +22,22 @@ from icalib.base.extras import load_rerun
 from icalib.base.files import staged
 from icalib.data.recordings import DamagedImageError, Recording, decode, open_recording
 from icalib.errors import CalibrationError, RecordingError
-from icalib.geometry import so3
-from icalib.geometry.small import hermite
 from icalib.geometry.targets import target_from_plain
 from icalib.kinds import presenters
 from icalib.report import rig_figures
 from icalib.report.figures import AXIS_COLORS, COLORS, REJECTED, curves
+from icalib.report.pictures import NEAR_TO_FAR, ends_of, shades
 from icalib.report.rig_figures import SIGMAS, VERDICT_COLORS, ellipsoids, magnification
 from icalib.result import Calibration, RecordingSpan, load_calibration
+from icalib.result.path import Clock, CubicPath
+from icalib.result.pictures import Mount, ScanPoints, cloud_in_image, scene_in_worlds, target_in_image
 from icalib.result.quantities import rows
 from icalib.rig import Camera, ImuSensor, Lidar, Rig
 from icalib.rig.file import rig_from_dict
 from icalib.sensors.camera.read import image_sources, sees
 from icalib.sensors.imu.read import time_series
 from icalib.sensors.lidar.read import scans
+from icalib.sensors.lidar.stream import LidarStream
 
 __all__ = ["view"]
 
@@ -181,57 +184,15 @@ def rgb(*colors: str) -> np.ndarray:
 
 # Shows the recording of a result: IMU readings, images and scans, placed by the calibration.
 #
-# Curves over time: residuals, velocity and biases. Poses of the body at any instant, interpolated between the
-# keyframes of a result.
+# Curves over time: residuals, velocity and biases.
 
 MOST_READINGS = 100_000  # shown of an IMU
 MOST_IMAGES = 600  # shown of a camera
 MOST_SCANS, MOST_POINTS = 400, 15_000  # shown of a sensor, and of a scan
 JPEG_QUALITY = 75
-_EDGE_S = 1.0  # data this long before and after the span of the result belong to it
 _HEIGHTS = (2.0, 98.0)  # percentiles of the height between which colours change
 
 Progress = Callable[[str, float], None]
-
-
-class ScanPoints(Protocol):
-    """The part of a stream of scans that is shown: see `LidarStream`."""
-
-    @property
-    def stamps_ns(self) -> np.ndarray: ...
-    @property
-    def start(self) -> np.ndarray: ...
-    @property
-    def offset_s(self) -> np.ndarray: ...
-    @property
-    def xyz(self) -> np.ndarray: ...
-
-
-@dataclass(frozen=True)
-class Clock:
-    """Converts raw stamps of one sensor to seconds of the result. offset_s: time offset, which is added to the stamps
-    to get the body's clock; span: the recording."""
-
-    span: RecordingSpan
-    offset_s: float
-
-    @classmethod
-    def of(cls, c: Calibration, span: RecordingSpan, sensor: str) -> Clock:
-        values = [g.value for g in c.groups if (g.sensor, g.name) == (sensor, "time_offset")]
-        if not values:
-            return cls(span, 0.0)
-        (value,) = values
-        return cls(span, float(value[c.recordings.index(span) if len(value) > 1 else 0]))
-
-    def seconds(self, stamps_ns: np.ndarray) -> np.ndarray:
-        """(n,) seconds of the result from int64 stamps [ns]. Whole nanoseconds are subtracted first, so that no digit
-        is lost."""
-        since = stamps_ns - np.int64(self.span.origin_ns) + np.int64(round(1e9 * self.offset_s))
-        return self.span.start + 1e-9 * since.astype(np.float64)
-
-    def within(self, seconds: np.ndarray) -> np.ndarray:
-        """(n,) bool: whether `seconds` (n,) are within the recording, or less than _EDGE_S outside."""
-        return (seconds > self.span.start - _EDGE_S) & (seconds < self.span.end + _EDGE_S)
 
 
 def span_of(c: Calibration, recording: Path) -> RecordingSpan:
@@ -305,7 +266,7 @@ class Recorded:
         """Sends images of the camera `name` one by one; images that are left out are not decoded."""
         seconds = self._clock(name).seconds(self.recording.stamps(topic))
         count = len(self._during(name, np.sort(seconds)))
-        clock, damaged, n_sent = self._clock(name), 0, 0
+        clock, damaged, show_points = self._clock(name), 0, self._points_in(s, name)
         within = (p for p in self.recording.payloads(topic) if clock.within(_instant(clock, p.stamp_ns))[0])
         for payload in islice(within, 0, None, _stride(count, MOST_IMAGES)):
             try:
@@ -313,13 +274,40 @@ class Recorded:
             except DamagedImageError:
                 damaged += 1
                 continue
-            s.at(f"{place(self.calibration, name)}/image", float(_instant(clock, payload.stamp_ns)[0]), image)
-            n_sent += 1
+            second = float(_instant(clock, payload.stamp_ns)[0])
+            s.at(f"{place(self.calibration, name)}/image", second, image)
+            show_points(payload.stamp_ns, second)
         notes = [f"{name}: {damaged} damaged images are not shown."] if damaged else []
         return notes + _thinned(name, count, MOST_IMAGES, "images")
 
+    def _points_in(self, s: RerunStream, camera: str) -> Callable[[int, float], None]:
+        """Function that sends the points of all LiDARs and the outline of the target in the image of `camera` with a
+        stamp [ns], at a time of the result [s]. Colours are those of the report, with one scale for all images."""
+        c, span, path = self.calibration, self.span, CubicPath.of(self.calibration)
+        at_camera, entity = Mount.of(c, span, camera), f"{place(c, camera)}/image"
+        mounts = {lidar: (at_camera, Mount.of(c, span, lidar)) for lidar in self.clouds}
+        ends: dict[str, tuple[float, float]] = {}
+
+        def show(stamp_ns: int, second: float) -> None:
+            for lidar, scans_of in self.clouds.items():
+                points = cloud_in_image(c, path, camera, mounts[lidar], scans_of, stamp_ns)
+                if len(points.uv):
+                    ends.setdefault(lidar, ends_of(points))
+                colors = rgb(*NEAR_TO_FAR)[shades(points, ends.get(lidar, (0.0, 1.0)))]
+                radius = s.rr.Radius.ui_points(POINT)
+                s.at(f"{entity}/{lidar}", second, s.rr.Points2D(points.uv + 0.5, colors=colors, radii=radius))
+            outline = _strips(target_in_image(c, path, camera, at_camera, second) + 0.5)
+            s.at(f"{entity}/target", second, s.rr.LineStrips2D(outline, colors=rgb(_TARGET)))
+
+        return show
+
+    @cached_property
+    def clouds(self) -> dict[str, LidarStream]:
+        """The scans of each LiDAR."""
+        return {x.name: scans(self.recording, x) for x in self.rig.sensors.values() if isinstance(x, Lidar)}
+
     def _scans(self, s: RerunStream, sensor: Lidar) -> list[str]:
-        stream = scans(self.recording, sensor)
+        stream = self.clouds[sensor.name]
         seconds = self._clock(sensor.name).seconds(stream.stamps_ns)
         inside = self._during(sensor.name, seconds)
         heights, path = None, CubicPath.of(self.calibration)
@@ -406,74 +394,6 @@ def _log_observations(s: RerunStream, c: Calibration) -> None:
         colors = rgb(_LEFT_OUT, _GOOD, REJECTED)[np.where(r.rejected, 2, r.used.astype(np.int64))]
         columns = rr.Points2D.columns(positions=r.uv + 0.5, colors=colors).partition(np.diff(r.start))
         s.over(entity, r.seconds, columns)
-
-
-LONGEST_STEP_S = 0.5  # longest interval between keyframes in which poses are interpolated
-_AT_KEYFRAME_S = 1e-6  # an instant this close to a keyframe has its pose
-
-
-@dataclass(frozen=True)
-class CubicPath:
-    """Cubic Hermite interpolation between K keyframes: of positions, and of the rotation vector from each keyframe to
-    the next.
-
-    The slopes at a keyframe are those of the parabola through it and its neighbours; the slope of the rotation is the
-    angular rate in the body's axes. seconds: on the clock of the result. usable (K - 1,) bool: whether poses in the
-    interval are known.
-    """
-
-    seconds: np.ndarray  # (K,)
-    rotation: np.ndarray  # (K, 3, 3) R_world_body
-    position: np.ndarray  # (K, 3) m, world
-    turn: np.ndarray  # (K - 1, 3) rad
-    rate: np.ndarray  # (K, 3) rad/s
-    slope: np.ndarray  # (K, 3) m/s
-    usable: np.ndarray
-
-    @classmethod
-    def of(cls, c: Calibration) -> CubicPath:
-        path = c.trajectory
-        step = np.diff(path.seconds)
-        usable = (np.diff(c.recording_of(path.seconds)) == 0) & (step <= LONGEST_STEP_S)
-        between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])
-        turn = so3.log_many(np.ascontiguousarray(between))
-        rate = _slopes(turn / step[:, None], step, usable)
-        slope = _slopes(np.diff(path.position, axis=0) / step[:, None], step, usable)
-        return cls(path.seconds, path.rotation, path.position, turn, rate, slope, usable)
-
-    def at(self, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """R_world_body (n, 3, 3), p_world_body (n, 3) m at `seconds` (n,) of the result, and (n,) bool: which of them
-        are known. The others are those of the nearest keyframe."""
-        last = max(len(self.seconds) - 2, 0)
-        k = np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, last)
-        h = self.seconds[k + 1] - self.seconds[k]
-        s = np.clip((seconds - self.seconds[k]) / h, 0.0, 1.0)
-        nearest = np.where(s < 0.5, k, k + 1)
-        at_keyframe = np.abs(seconds - self.seconds[nearest]) <= _AT_KEYFRAME_S
-        inside = self.usable[k] & (seconds >= self.seconds[0]) & (seconds <= self.seconds[-1])
-        s = np.where(inside, s, np.round(s))[:, None]
-        turn = self.turn[k]
-        # The rate at the later keyframe as a derivative of the rotation vector: inverse right Jacobian, second order.
-        far = self.rate[k + 1]
-        far = far + 0.5 * np.cross(turn, far) + np.cross(turn, np.cross(turn, far)) / 12.0
-        phi = hermite(s, turn, h[:, None] * self.rate[k], h[:, None] * far)
-        chord = self.position[k + 1] - self.position[k]
-        displacement = hermite(s, chord, h[:, None] * self.slope[k], h[:, None] * self.slope[k + 1])
-        R = self.rotation[k] @ so3.exp_many(np.ascontiguousarray(phi))
-        return R, self.position[k] + displacement, inside | at_keyframe
-
-
-def _slopes(between: np.ndarray, step: np.ndarray, usable: np.ndarray) -> np.ndarray:
-    """(K, 3) slopes at the keyframes, from the mean slopes `between` (K - 1, 3) over steps (K - 1,) s; those that are
-    not `usable` have no weight."""
-    weight = np.zeros((2, len(step) + 1))  # of the intervals before and after each keyframe
-    weight[0, 1:], weight[1, :-1] = usable, usable
-    i = np.flatnonzero((weight > 0.0).all(axis=0))
-    weight[0, i], weight[1, i] = step[i], step[i - 1]
-    padded = np.zeros((2, len(step) + 1, 3))
-    padded[0, 1:], padded[1, :-1] = between, between
-    total = np.maximum(weight.sum(axis=0), np.finfo(float).tiny)
-    return (weight[:, :, None] * padded).sum(axis=0) / total[:, None]
 
 
 # Layout of the viewer's windows: world, rig, cameras, and curves over time.
@@ -588,7 +508,7 @@ def log_motion(s: RerunStream, c: Calibration) -> None:
 def log_target(s: RerunStream, c: Calibration) -> None:
     """Sends outline and points of each body of the target. The target has one orientation in the world per
     recording."""
-    target, orientations = target_from_plain(c.rig), rig_figures.scene_in_worlds(c)
+    target, orientations = target_from_plain(c.rig), scene_in_worlds(c)
     if target is None or not orientations:
         return
     for span, (_, R) in zip(spans(c), orientations, strict=False):

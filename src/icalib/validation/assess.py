@@ -49,6 +49,7 @@ from icalib.result.calibration import Timeline, row_record, versions
 from icalib.result.verdict import AUXILIARY, failure_words
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.validation.causes import all_causes, scatter_warnings
 from icalib.validation.guesses import guess_notes
 
@@ -110,7 +111,15 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         versions=versions(),
         recordings=timeline.spans,
         planes=tuple(plane for a in assessments(assessed) for plane in a.planes),
+        first_guess=_first_guess(inputs),
     )
+
+
+def _first_guess(inputs: Inputs) -> dict[tuple[str, str], np.ndarray]:
+    """Extrinsics and time offsets in the first guess, if it is kept, as in the result."""
+    guess = inputs.guess
+    blocks = [b for b in inputs.layout.blocks if guess and b.name in MOUNTED_NAMES and b.key in guess.values]
+    return {b.key: _raw_value(inputs, guess, b) for b in blocks} if guess else {}
 
 
 def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) -> Observability:

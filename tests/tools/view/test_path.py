@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from icalib.tools.view import CubicPath, by_value
+from icalib.result.path import CubicPath
+from icalib.tools.view import by_value
 
 
 def _pose(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

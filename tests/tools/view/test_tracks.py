@@ -11,7 +11,7 @@ import pytest
 from icalib.cli import main
 from icalib.pipeline import calibrate_measurements
 from icalib.result import by_key
-from icalib.sensors.camera.stream import TrackResiduals, rms_of_images
+from icalib.sensors.camera.stream import TrackResiduals
 from icalib.tools.simulation import load_scenario, rig_for, simulate, with_drawn_guess
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "paper" / "table2-3d.yaml"
@@ -45,7 +45,7 @@ def test_observations_are_on_the_pixels_that_were_measured(shown: tuple[TrackRes
 
 def test_their_size_is_over_time(shown: tuple[TrackResiduals, dict]):
     r, found = shown
-    rows, rms = found["residuals/cam0/observations"], rms_of_images(r)
+    rows, rms = found["residuals/cam0/observations"], r.rms_of_images
     seconds, rms = r.seconds[np.isfinite(rms)], rms[np.isfinite(rms)]
     moving = np.isfinite(rows.seconds)
     np.testing.assert_allclose(rows.seconds[moving], seconds, atol=1e-9)

@@ -12,7 +12,7 @@ from icalib.report.page import Html, Presenter, Section, element, html, plot_pla
 from icalib.report.rig_figures import PEN_UP
 from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.quantities import format_number
-from icalib.sensors.camera.stream import ImageResiduals, image_of, rms_of_images
+from icalib.sensors.camera.stream import ImageResiduals, image_of
 
 # Figures of the residuals (predicted - measured) of one camera, for corners or tracked points.
 
@@ -59,7 +59,7 @@ def residuals_over_time(r: ImageResiduals) -> Figure:
     size = np.linalg.norm(r.residual, axis=1)
     used, rejected = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
     some, few = used[thin(len(used), MOST_DOTS)], rejected[thin(len(rejected), MOST_DOTS)]
-    rms, keep = rms_of_images(r), thin(len(r.seconds), MOST_DOTS)
+    rms, keep = r.rms_of_images, thin(len(r.seconds), MOST_DOTS)
     top = 1.5 * float(size[used].max(initial=1e-3))
     seconds, clipped = r.seconds[image_of(r)], "rejected (clipped to the frame)"
     return figure(
@@ -197,7 +197,7 @@ def _projection_section(c: Calibration) -> Section:
 
 def curves(r: ImageResiduals) -> Iterator[ResidualCurve]:
     """Curve of the residual RMS [px] per image over time, for images with points in use."""
-    rms = rms_of_images(r)
+    rms = r.rms_of_images
     some = np.isfinite(rms)
     yield ResidualCurve(r.kind, r.seconds[some], rms[some, None], (f"RMS of {r.kind} [px]",))
 

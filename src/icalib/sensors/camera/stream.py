@@ -66,9 +66,9 @@ class CornerStream(_ImageStream):
         """The corners `rows` (indices or mask), grouped into images at stamps_ns (M,) with count (M,) corners each."""
         start = np.concatenate([[0], np.cumsum(count)]).astype(np.int64)
         sigma, edges = (x[rows] if len(x) else x for x in (self.sigma, self.edges))
-        point, uv, files = self.point[rows], self.uv[rows], self.files
+        point, uv, of_images = self.point[rows], self.uv[rows], {"files": self.files, "pictures": self.pictures}
         return CornerStream(
-            self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, files=files, jitter_s=self.jitter_s
+            self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, jitter_s=self.jitter_s, **of_images
         )
 
     @classmethod
@@ -178,6 +178,14 @@ class _PointsInImages:
         """(N, 2) residuals over their standard deviations; NaN for observations without a residual."""
         return self.residual / self.sigma[:, None]
 
+    @property
+    def rms_of_images(self) -> np.ndarray:
+        """(M,) px: RMS per coordinate of each image, NaN if it has no residuals in use."""
+        image, square = image_of(self)[self.used], (self.residual[self.used].astype(np.float64) ** 2).sum(axis=1)
+        n_images = len(self.start) - 1
+        count = np.bincount(image, minlength=n_images)
+        return np.sqrt(np.bincount(image, square, n_images) / np.where(count > 0, 2.0 * count, np.nan))
+
     def normalised(self) -> dict[str, np.ndarray]:
         """Whitened residuals in use, u and v in one array, keyed by the title of their plot."""
         return {f"{self.kind} (u and v)": self.whitened[self.used].ravel()}
@@ -249,10 +257,3 @@ ImageResiduals = CornerResiduals | TrackResiduals
 def image_of(r: _PointsInImages) -> np.ndarray:
     """(N,) index of the image of each residual."""
     return np.repeat(np.arange(len(r.start) - 1), np.diff(r.start))
-
-
-def rms_of_images(r: ImageResiduals) -> np.ndarray:
-    """(M,) px: RMS per coordinate of each image, NaN if it has no residuals in use."""
-    image, square = image_of(r)[r.used], (r.residual[r.used].astype(np.float64) ** 2).sum(axis=1)
-    count = np.bincount(image, minlength=len(r.seconds))
-    return np.sqrt(np.bincount(image, square, len(r.seconds)) / np.where(count > 0, 2.0 * count, np.nan))

@@ -15,6 +15,7 @@ from icalib.data.messages import HasMessages, MessageType, UnreadType
 from icalib.data.recording import Reader, Reading, ReadStream, Recording
 from icalib.data.stamps import rate_sentence
 from icalib.data.tables import STAMP, TableFile, TableKind, read_table
+from icalib.detection.images import MOST_PICTURES
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.rig import PLAIN_TABLE, Rig
@@ -171,8 +172,8 @@ def _tracks(recording: Recording, cameras: Sequence[Camera], reading: Reading) -
     image_topics(recording, pictured)
     above = 1 + max((int(t.feature.max(initial=-1)) for t in tables.values()), default=-1)
     what = f"tracking features in the images of {' and '.join(c.name for c in pictured)}"
-    keep = reading.rig.settings.cache_corners
-    of_recording = find_all_tracks(recording, pictured, keep, lambda done: reading.progress(what, done))
+    keep, pictures = reading.rig.settings.cache_corners, _pictures(reading.rig)
+    of_recording = find_all_tracks(recording, pictured, keep, lambda done: reading.progress(what, done), pictures)
     of_images = {
         stream.name: (replace(stream, feature=stream.feature + above), notes) for stream, notes in of_recording
     }
@@ -209,7 +210,12 @@ def _image_corners(recording: Recording, camera: Camera, reading: Reading) -> tu
         share = (names.index(camera.name) + done) / len(names)
         reading.progress(f"finding the target in the images of {camera.name}", share)
 
-    return find_corners(recording, camera, rig.target, rig.settings.cache_corners, show)
+    return find_corners(recording, camera, rig.target, rig.settings.cache_corners, show, _pictures(rig))
+
+
+def _pictures(rig: Rig) -> int:
+    """Most images of a camera that are kept to be shown."""
+    return MOST_PICTURES if rig.settings.images_in_report else 0
 
 
 # CameraInfo messages of ROS: resolution and intrinsics that a camera driver states.

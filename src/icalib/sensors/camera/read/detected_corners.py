@@ -27,6 +27,7 @@ from icalib.detection.detectors import (
 from icalib.detection.growth import MOTION_IMAGES
 from icalib.detection.images import (
     Progress,
+    SeenImages,
     batches_of,
     image_count,
     keep_corners,
@@ -63,20 +64,27 @@ Sample = Callable[[], list[np.ndarray]]  # some images of the recording (h, w) u
 
 
 def find_corners(
-    recording: Recording, camera: Camera, target: Target, keep: bool = True, progress: Progress = lambda _: None
+    recording: Recording,
+    camera: Camera,
+    target: Target,
+    keep: bool = True,
+    progress: Progress = lambda _: None,
+    pictures: int = 0,
 ) -> tuple[CornerStream, tuple[Remark, ...]]:
     """The target's corners in all images of `camera`, and sentences on images, tags and corners that were left out.
 
-    With `keep`, corners of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
-    the camera has no images, their resolution is wrong, they cannot be read, or none shows the target.
+    With `keep`, corners of an earlier run are loaded from the cache, and new ones are saved. pictures: most images that
+    the stream keeps to be shown. Raises RecordingError if the camera has no images, their resolution is wrong, they
+    cannot be read, or none shows the target.
     """
     topic, where = image_topic(recording, camera), recording.where(camera)
     sample = cache(lambda: list(spread_images(recording, topic)))
-    files: dict[int, str] = {}
-    key = stream_key(camera_images(recording, camera, files), repr(target)) if keep else ""
+    count = image_count(recording, topic)
+    seen = SeenImages(count, pictures)
+    key = stream_key(camera_images(recording, camera, seen), repr(target)) if keep else ""
     detections = load_corners(key) if keep else None
     if detections is None:
-        count, payloads = image_count(recording, topic), camera_images(recording, camera, files)
+        payloads = camera_images(recording, camera, seen)
         detections = _search(payloads, detector_of(target), where, lambda n: progress(n / max(count, n)))
         if wrong := _other_layout(sample, target, detections[1]):
             raise RecordingError(f"{where}: {wrong}")
@@ -89,9 +97,9 @@ def find_corners(
         raise RecordingError(what + _visible_instead(sample(), target))
     if wrong := _other_border(sample, target, images):
         raise RecordingError(f"{where}: hardly any detections of {wrong}")
-    corners = replace(corner_stream(camera.name, stamps_ns, images), files=files)
-    damaged = sorted(files.keys() - set(stamps_ns.tolist()))
-    notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, files))
+    corners = replace(corner_stream(camera.name, stamps_ns, images), files=seen.files, pictures=seen.pictures)
+    damaged = sorted(seen.files.keys() - set(stamps_ns.tolist()))
+    notes = (*sightings(target, images), *rare, *words_on_damaged(damaged, seen.files))
     return corners, tuple(note.with_sentence(f"{where}: {note}") for note in notes)
 
 
@@ -199,9 +207,8 @@ def image_topic(recording: Recording, camera: Camera) -> str:
     return recording.image_topic(camera.name, camera.topic)
 
 
-def camera_images(recording: Recording, camera: Camera, files: dict[int, str]) -> Iterator[Payload]:
-    """The undecoded images of the camera. Fills `files` with the file name of each by its stamp, "" for those that come
-    from no file.
+def camera_images(recording: Recording, camera: Camera, seen: SeenImages) -> Iterator[Payload]:
+    """The undecoded images of the camera, each of which is added to `seen`.
 
     Raises RecordingError as `Recording.payloads`, and at the first image whose resolution is not the camera's.
     """
@@ -212,7 +219,7 @@ def camera_images(recording: Recording, camera: Camera, files: dict[int, str]) -
                 f"{where}: images have {p.width} x {p.height} px, but {camera.name} {camera.resolution[0]} x "
                 f"{camera.resolution[1]}; correct its resolution in the rig file."
             )
-        files[p.stamp_ns] = p.name
+        seen.add(p)
         yield p
 
 
@@ -271,11 +278,12 @@ def _rows(streams: Iterable[CornerStream | TrackStream], stamps_ns: np.ndarray) 
 def _moved(stream: CornerStream | TrackStream, stamps_ns: np.ndarray, even: EvenStamps) -> CornerStream | TrackStream:
     """The stream with even stamps. stamps_ns (M,): the original ones of `even`."""
     moved = even.stamps_ns[np.searchsorted(stamps_ns, stream.stamps_ns)]
-    if isinstance(stream, TrackStream):
-        return replace(stream, stamps_ns=moved, jitter_s=even.left_s)
     new = dict(zip(stream.stamps_ns.tolist(), moved.tolist(), strict=True))
+    pictures = {new[stamp]: image for stamp, image in stream.pictures.items() if stamp in new}
+    if isinstance(stream, TrackStream):
+        return replace(stream, stamps_ns=moved, pictures=pictures, jitter_s=even.left_s)
     files = {new.get(stamp, stamp): file for stamp, file in stream.files.items()}
-    return replace(stream, stamps_ns=moved, files=files, jitter_s=even.left_s)
+    return replace(stream, stamps_ns=moved, files=files, pictures=pictures, jitter_s=even.left_s)
 
 
 # Checks corners and tracks: image bounds, order and rate of stamps, and number of corners per image.

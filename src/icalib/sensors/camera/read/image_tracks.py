@@ -16,6 +16,7 @@ from icalib.data.measurements import TrackStream
 from icalib.data.recordings import DamagedImageError, Payload, Recording, decode
 from icalib.detection.images import (
     Progress,
+    SeenImages,
     batches_of,
     image_count,
     keep_arrays,
@@ -81,43 +82,54 @@ class _TrackArrays:
 
 
 def find_all_tracks(
-    recording: Recording, cameras: Sequence[Camera], keep: bool = True, progress: Progress = lambda _: None
+    recording: Recording,
+    cameras: Sequence[Camera],
+    keep: bool = True,
+    progress: Progress = lambda _: None,
+    pictures: int = 0,
 ) -> list[tuple[TrackStream, tuple[Remark, ...]]]:
     """Feature tracks of each of the cameras, and sentences on rejected points. A feature number is the same point in
     all cameras; pairs of cameras with a common field of view share features. Raises RecordingError as `find_tracks`."""
     by_camera = []
     for k, camera in enumerate(cameras):
-        by_camera.append(find_tracks(recording, camera, keep, lambda done, k=k: progress((k + done) / len(cameras))))
+        show = lambda done, k=k: progress((k + done) / len(cameras))  # noqa: E731
+        by_camera.append(find_tracks(recording, camera, keep, show, pictures))
     first = np.cumsum([0, *(int(stream.feature.max(initial=-1)) + 1 for stream, _ in by_camera)])
     apart = [replace(stream, feature=stream.feature + n) for n, (stream, _) in zip(first, by_camera, strict=False)]
     return list(zip(matched(recording, cameras, apart), (notes for _, notes in by_camera), strict=True))
 
 
 def find_tracks(
-    recording: Recording, camera: Camera, keep: bool = True, progress: Progress = lambda _: None
+    recording: Recording,
+    camera: Camera,
+    keep: bool = True,
+    progress: Progress = lambda _: None,
+    pictures: int = 0,
 ) -> tuple[TrackStream, tuple[Remark, ...]]:
     """Feature tracks of all images of `camera`, numbered from 0, and sentences on images and points that were left out.
 
-    With `keep`, tracks of an earlier run are loaded from the cache, and new ones are saved. Raises RecordingError if
-    the camera has no images, their resolution is wrong, they cannot be read, or they show nothing to track.
+    With `keep`, tracks of an earlier run are loaded from the cache, and new ones are saved. pictures: most images that
+    the stream keeps to be shown. Raises RecordingError if the camera has no images, their resolution is wrong, they
+    cannot be read, or they show nothing to track.
     """
     topic, where = image_topic(recording, camera), recording.where(camera)
-    files: dict[int, str] = {}
-    key = stream_key(camera_images(recording, camera, files), f"tracks {TRACKER_VERSION}") if keep else ""
+    count = image_count(recording, topic)
+    seen = SeenImages(count, pictures)
+    key = stream_key(camera_images(recording, camera, seen), f"tracks {TRACKER_VERSION}") if keep else ""
     kept = load_kept(key, (*_COLUMNS, *_COUNTS)) if keep else None
     if kept is not None:
         stamps_ns, start, feature, uv, views, spread, damaged_ns = (kept[name] for name in _COLUMNS)
         moving, in_place = (int(kept[name]) for name in _COUNTS)
         tracks = _TrackArrays(stamps_ns, start, feature, uv, views, spread, moving, in_place, damaged_ns)
     else:
-        count, payloads = image_count(recording, topic), camera_images(recording, camera, files)
+        payloads = camera_images(recording, camera, seen)
         tracks = _track(payloads, lambda n: progress(n / max(count, n)))
         if not len(tracks.stamps_ns):
             raise RecordingError(tracks.error or f"{where}: there are no images; check that the camera was running.")
         if keep:
             keep_arrays(key, {name: np.asarray(getattr(tracks, name)) for name in (*_COLUMNS, *_COUNTS)})
-    stream = _stream(camera.name, tracks, where)
-    return stream, tuple(note.with_sentence(f"{where}: {note}") for note in _notes(tracks, files))
+    stream = replace(_stream(camera.name, tracks, where), pictures=seen.pictures)
+    return stream, tuple(note.with_sentence(f"{where}: {note}") for note in _notes(tracks, seen.files))
 
 
 def _track(payloads: Iterator[Payload], done: Callable[[int], None]) -> _TrackArrays:

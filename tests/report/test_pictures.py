@@ -1,0 +1,99 @@
+"""Images in the report: what is drawn over them, how large they are, and that none is there where none is wanted."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from icalib.cli import main
+from icalib.detection.images import MOST_BYTES
+from icalib.errors import CalibrationError
+from icalib.report import report_html
+from icalib.report.pictures import MOST_MARKS, NEAR_TO_FAR, figures
+from icalib.result import Calibration
+from icalib.result.calibration import PointsInImage, ReportImage
+from icalib.result.pictures import MOST_POINTS
+
+JPEG = cv2.imencode(".jpg", np.tile(np.arange(200, dtype=np.uint8), (128, 1)))[1].tobytes()
+TRIANGLE = np.array([[10.0, 10.0], [90.0, 10.0], [10.0, 90.0], [np.nan, np.nan], [300.0, 200.0], [310.0, 200.0]])
+MOST_OF_POINTS = 24 * MOST_POINTS  # bytes: at most "M1234 5678h0" in each of two drawings
+
+
+def cloud(count: int) -> PointsInImage:
+    u, v = np.random.default_rng(2).uniform([1000, 1000], [3000, 2000], (count, 2)).T
+    return PointsInImage(np.stack([u, v], axis=1), np.geomspace(30.0, 2.0, count))
+
+
+def with_images(c: Calibration, jpeg: bytes = JPEG, count: int = 24) -> Calibration:
+    second = float(c.corner_residuals[0].seconds[70])
+    corners = ReportImage("cam0", second, "the worst of 20 images, 0.3 px RMS", jpeg, TRIANGLE)
+    points = replace(corners, file="<pose>.jpg", sensor="lidar0", before=cloud(count), after=cloud(count))
+    return replace(c, pictures=(corners, points))
+
+
+def paths(svg: str, css: str) -> list[str]:
+    return re.findall(rf'<path class="{css}"[^>]* d="([^"]*)"', svg)
+
+
+def test_points_are_coloured_by_distance_and_the_outline_has_two_lines(calibration: Calibration):
+    _, (before, _), (after, words) = figures(with_images(calibration))
+    colours = re.findall(r'class="dots" stroke="(#\w+)"', after)
+    assert colours == [*reversed(NEAR_TO_FAR)]  # the nearest last, over the others
+    assert sum(path.count("M") for path in paths(after, "dots")) == 24
+    assert paths(after, "outline") == ["M10.0 10.0L90.0 10.0L10.0 90.0M300.0 200.0L310.0 200.0"]
+    assert words.startswith("As calibrated. lidar0 in cam0 <pose>.jpg, the worst of 20 images")
+    assert "base64" in before
+    assert "base64" not in after
+
+
+def test_lines_lead_to_where_a_point_is_projected(calibration: Calibration):
+    """A residual of +1 px in u is a line to the right; a rejected corner is a cross."""
+    c = with_images(calibration)
+    r = c.corner_residuals[0]
+    rejected = np.zeros(len(r.uv), bool)
+    rejected[r.start[70]] = True
+    ones = replace(r, residual=np.tile([1.0, 0.0], (len(r.uv), 1)), rejected=rejected)
+    svg, words = next(iter(figures(replace(c, residuals=c.residuals | {("cam0", "corners"): ones}))))
+    count = int(np.diff(r.start)[70])
+    lines = re.findall(r"M([\d.]+) ([\d.]+)l([-\d.]+) ([-\d.]+)", "".join(paths(svg, "residual")))
+    assert len(lines) == count <= MOST_MARKS
+    assert {(float(du), float(dv)) for _, _, du, dv in lines} == {(20.0, 0.0)}
+    np.testing.assert_allclose([float(u) for u, *_ in lines], r.uv[r.start[70] : r.start[71], 0], atol=0.051)
+    assert paths(svg, "rejected")[0].count("M") == 1
+    assert f"{count - 1} corners, 1 rejected; residuals are 20 times as long" in words
+
+
+def test_the_page_holds_its_images(calibration: Calibration):
+    _, found = report_html(with_images(calibration)).split('<section id="pictures">')
+    section, _ = found.split("</section>", 1)
+    assert "&lt;pose&gt;.jpg" in section
+    links = re.findall(r'(?:src|href)="([^"]*)"', section)
+    assert [link.split(",")[0] for link in links] == 2 * ["data:image/jpeg;base64"] + ["#shot-1"]
+    assert "What the sensors saw" not in report_html(calibration)
+
+
+def test_pictures_have_a_bounded_size(calibration: Calibration):
+    noise = np.random.default_rng(0).bytes(MOST_BYTES)
+    corners, *points = figures(with_images(calibration, noise, MOST_POINTS))
+    in_page = 4 / 3 * MOST_BYTES + 2_000
+    assert len(corners[0]) < in_page + 100 * MOST_MARKS
+    assert sum(len(svg) for svg, _ in points) < in_page + MOST_OF_POINTS + 4_000
+
+
+@pytest.mark.parametrize(("option", "wanted"), [([], True), (["--no-images"], False)])
+def test_no_images_are_kept_where_the_command_says_so(option, wanted, tmp_path, monkeypatch):
+    rigs = []
+
+    def calibrate(rig, *_, **__):
+        rigs.append(rig)
+        raise CalibrationError("enough.")
+
+    monkeypatch.setattr("icalib.pipeline.calibrate", calibrate)
+    rig = tmp_path / "rig.yaml"
+    rig.write_text("sensors:\n  cam0: {type: camera, model: eucm, resolution: [64, 48], tracks: images}\n")
+    assert main(["calibrate", str(rig), str(tmp_path), "-o", str(tmp_path / "out"), *option]) == 1
+    assert [r.settings.images_in_report for r in rigs] == [wanted]
