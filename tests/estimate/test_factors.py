@@ -43,6 +43,7 @@ from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
 from icalib.sensors.imu.residual import ImuFactor, free_columns
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.board_factor import ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints
+from icalib.sensors.lidar.patch_factor import PatchFactor, PatchPoints, PatchRows
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
 from icalib.sensors.position.stream import PositionStream
@@ -687,6 +688,26 @@ def board_sample(kind, loss: Loss = "none", curved=False):
     return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
+def patch_sample(loss: Loss = "none", curved=False):
+    """Rows of any combinations of points on patches, of three LiDARs of which one is the body."""
+    rng, n, names = np.random.default_rng(10), 40, ("lidar0", "lidar1", "lidar2")
+    specs = [(name, spec) for name in names for spec in Lidar.parameters]
+    free = [name != "lidar0" and spec.name in ("rotation", "translation") for name, spec in specs]
+    layout = make_layout([spec.entry(name, f) for (name, spec), f in zip(specs, free, strict=True)])
+    values = {
+        (b.sensor, b.name): so3.exp(rng.normal(size=3)) if b.kind == "rotation" else rng.normal(size=b.size)
+        for b in layout.blocks
+    }
+    still = np.tile(np.eye(3), (4, 1, 1)), np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((4, 6))
+    normal, offset, moments = rng.normal(size=(n, 3)), rng.normal(size=(n, 3)), rng.normal(size=(n, 3, 3))
+    rows = PatchRows(offset, moments, normal, rng.normal(size=(n, 3)), np.sort(rng.integers(0, 4, n)), 0.02)
+    none = PatchPoints(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0, int))
+    noise = LidarNoise(1.0, 0.0, loss, LOSS_SCALE)
+    made = PatchFactor("lidar0", names, none, rows, noise, (0,), 4, layout)
+    setup = SimpleNamespace(layout=layout, columns_scale=lambda: np.full(layout.size, 1e-2))
+    return row_sample(setup, State(np.arange(4.0), *still, values), made, loss if curved else "none", curved)
+
+
 SAMPLES = {
     "imu": ("ImuFactor", lambda u, s, f: imu_sample(u, s, False)),
     "imu, intrinsics": ("ImuFactor", lambda u, s, f: imu_sample(u, s, True)),
@@ -761,6 +782,8 @@ SAMPLES = {
         lambda u, s, f: lidar_sample(*s, scheme="pose", loss="cauchy", imu_free=True),
     ),
     "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
+    "shared surfaces": ("PatchFactor", lambda u, s, f: patch_sample()),
+    "shared surfaces, huber, curved": ("PatchFactor", lambda u, s, f: patch_sample("huber", True)),
     "points on boards": ("BoardFactor", lambda u, s, f: board_sample(ON_BOARDS)),
     "edges of boards, huber, curved": ("BoardFactor", lambda u, s, f: board_sample(ON_EDGES, "huber", True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),

@@ -143,7 +143,7 @@ def _taking_part(rig: Rig, association: PlaneAssociation) -> tuple[Sensor, ...]:
 
 def _takes_part(sensor: Sensor, association: PlaneAssociation) -> bool:
     """Whether the sensor has parameters and factors: one that shows planes only once these are known."""
-    return association.count > 0 or association.on_target or not sensor.shows_planes
+    return association.count > 0 or association.at_rest or not sensor.shows_planes
 
 
 def origin_difference(measurements: Measurements, stream: Stream) -> float:

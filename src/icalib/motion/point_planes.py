@@ -63,11 +63,12 @@ def thinned(plane: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class PlaneAssociation:
     """Index of the plane of each LiDAR point. names (P,): of the planes, different from all sensor names. plane: for
-    each LiDAR (N,) int32, plane of each point, -1 for none. on_target: points lie on the target instead."""
+    each LiDAR (N,) int32, plane of each point, -1 for none. at_rest: no planes are estimated, because points lie on the
+    target, or on surfaces that LiDARs share."""
 
     names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
-    on_target: bool = False
+    at_rest: bool = False
 
     @property
     def count(self) -> int:
@@ -97,7 +98,7 @@ class PlaneAssociation:
 
 
 NO_ASSOCIATION = PlaneAssociation((), ())
-WITH_TARGET = PlaneAssociation((), (), on_target=True)
+AT_REST = PlaneAssociation((), (), at_rest=True)
 
 
 def joined_associations(each: Sequence[PlaneAssociation]) -> PlaneAssociation:

@@ -45,7 +45,7 @@ class LidarNoise:
     """Noise of a point's distance from its plane. sigma [m]: isotropic part. beam_sigma [m]: range noise along the
     beam, projected on the normal. loss: robust loss; loss_scale: its scale in standard deviations. edge_scale: noise of
     the middle of a ring on a sheet over that of rounding to beams. inflation: factor on the noise of points on a sheet,
-    whose errors correlate."""
+    whose errors correlate. flatness [m]: deviation from planes of surfaces at rest that LiDARs share."""
 
     sigma: float
     beam_sigma: float = 0.0
@@ -53,6 +53,7 @@ class LidarNoise:
     loss_scale: float = 2.5
     edge_scale: float = 3.0  # before residuals are known: beams are as wide as their steps, and the pose is rough
     inflation: float = 1.0
+    flatness: float = 0.02  # walls and roads within a metre or two
 
 
 @dataclass(frozen=True)

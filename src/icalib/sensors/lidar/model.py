@@ -16,6 +16,7 @@ from icalib.optim.state import Key
 from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.board_factor import ON_EDGES, BoardFactor
+from icalib.sensors.lidar.patch_factor import PatchFactor
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.lidar.spec import RANGE_OFFSET
 
@@ -65,10 +66,12 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         for factor, out in pairs_of(end.factors, end.residuals, BoardFactor):
             sensor = next(s for s in sensors if s.name == factor.name)
             next_noise[sensor.name] = _on_boards(sensor, next_noise[sensor.name], factor, out)
+        for factor, _ in pairs_of(end.factors, end.residuals, PatchFactor):
+            next_noise[factor.name] = replace(factor.noise, flatness=factor.measured_flatness(end.state))
         return next_noise
 
     def passes(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> int:
-        if rig.imu is None and rig.has_target:
+        if rig.imu is None:
             return 2  # the first estimate of errors that points share is rough
         return int(any(s.range_noise_m is None for s in sensors))
 
@@ -76,12 +79,20 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         """One factor for all points on planes, at rest for those on the target. Coarse passes use fewer points and
         longer bins."""
         if at.motion is None:
-            yield from BoardFactor.build(stream, noise, at)
+            yield from BoardFactor.build(stream, noise, at) if at.rig.has_target else ()
             return
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
         yield LidarFactor.build(stream, used, at.association.keys, at.motion, noise, at.layout, scheme, bin_s)
+
+    def joint_factors(
+        self, sensors: Sequence[Lidar], factors: Sequence[Factor], noise: Mapping[str, LidarNoise], at: Pass
+    ) -> Sequence[Factor]:
+        """At rest without a target: the factor of all surfaces that the LiDARs share."""
+        if at.motion is not None or at.rig.has_target:
+            return ()
+        return (PatchFactor.build(noise[at.rig.reference], at),)
 
     def points_on_planes(self, sensor: Lidar, stream: LidarStream, at: Pass) -> tuple[np.ndarray, np.ndarray]:
         """See `binning.points_on_planes`."""

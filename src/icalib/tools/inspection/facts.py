@@ -375,6 +375,12 @@ def beside_target(inspection: Inspection, name: str) -> bool:
     return bool(independent(inspection)) and inspection.sources.sensors[name].topic.type == CLOUD_FILES
 
 
+def at_stops(inspection: Inspection) -> bool:
+    """Whether all sensors were at rest: clouds of several LiDARs are files."""
+    types = [source.topic.type for source in inspection.sources.sensors.values()]
+    return len(types) > 1 and set(types) == {CLOUD_FILES}
+
+
 def problem_of(inspection: Inspection, name: str) -> str:
     """Why the data of a sensor cannot be read; "" if they can."""
     return inspection.stream(inspection.sources.sensors[name].topic).problem
@@ -506,6 +512,12 @@ def missing_sensors(inspection: Inspection) -> Iterator[Finding]:
         yield from _beside_an_imu(inspection, topic_list)
     elif independent(inspection):
         yield _independent_without_imu(inspection, topic_list)
+    elif at_stops(inspection):
+        yield Finding(
+            "hint",
+            "The clouds of a number or stamp are taken as a stop at which the rig stands still; the LiDARs are "
+            "calibrated to each other by the surfaces that they share.",
+        )
     elif moves_without_imu(inspection):
         yield Finding(
             "hint",

@@ -24,6 +24,7 @@ from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, times
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.assess.boards import on_boards
+from icalib.sensors.lidar.assess.patches import on_patches
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.lidar.stream import LidarResiduals
@@ -41,8 +42,8 @@ HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of res
 
 def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
-    if a.inputs.association.on_target:
-        return on_boards(a)
+    if a.inputs.association.at_rest:
+        return on_boards(a) if a.inputs.rig.has_target else on_patches(a)
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),

@@ -27,6 +27,7 @@ from icalib.sensors.lidar.initialize.association import lidar_values, state_from
 from icalib.sensors.lidar.initialize.boards import guess_at_rest, is_at_rest
 from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
+from icalib.sensors.lidar.initialize.surroundings import are_stops, guess_by_surroundings, stops
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error, leading
 
 
@@ -37,15 +38,19 @@ class LidarInitializer(Initializer[Lidar]):
     moves_keyframes = True
 
     def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
-        """The recordings without points on the robot itself. Without an IMU, a rig that sees a target may be at rest,
-        and all points keep their place."""
-        return recordings if rig.imu is None and rig.has_target else [without_self_returns(m) for m in recordings]
+        """The recordings without points on the robot itself. At rest, which a rig without an IMU that sees a target may
+        be, all points keep their place."""
+        at_rest = rig.imu is None and (rig.has_target or are_stops(rig, recordings))
+        return recordings if at_rest else [without_self_returns(m) for m in recordings]
 
     def motion_source(self, rig: Rig) -> MotionSource | None:
         return MotionSource(BY_SCANS, tuple(s.name for s in rig.lidars)) if rig.lidars else None
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
-        """See `Initializer`: by the first LiDAR, or another one that shows all directions far better."""
+        """See `Initializer`: by the first LiDAR, or another one that shows all directions far better; at rest at
+        the stops of the first."""
+        if are_stops(rig, recordings):
+            return BodyTrajectory([stops(m) for m in recordings])
         best = leading(recordings) if rig.reference == rig.lidars[0].name else 0
         reference = rig.lidars[best].name if best else ""
         return BodyTrajectory([scan_poses(m.lidars[best]) for m in recordings], reference=reference)
@@ -79,7 +84,9 @@ class LidarInitializer(Initializer[Lidar]):
     def start_at_rest(
         self, rig: Rig, recordings: Sequence[Measurements], body_poses: Sequence[BodyPoses], values: Values
     ) -> InitialGuess | None:
-        """See `Initializer`: by the target in images and clouds."""
+        """See `Initializer`: by the target in images and clouds, or by what LiDARs see alike."""
+        if are_stops(rig, recordings):
+            return guess_by_surroundings(rig, recordings)
         if rig.has_target and is_at_rest(rig, body_poses):
             return guess_at_rest(rig, recordings, body_poses, values)
         return None

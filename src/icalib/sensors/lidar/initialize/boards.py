@@ -26,7 +26,7 @@ from icalib.geometry.targets.base import BOARD
 from icalib.initialize.initializer import InitialGuess, Values, stated_values
 from icalib.initialize.smooth_trajectory import BodyPoses
 from icalib.motion.factor import Extrinsics
-from icalib.motion.point_planes import WITH_TARGET
+from icalib.motion.point_planes import AT_REST
 from icalib.optim.state import State, in_recording
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.board_factor import RIM_M
@@ -219,7 +219,7 @@ def guess_at_rest(
     known = [replace(s, time_offset=fixed(np.zeros(1)), clock_restarts=False) for s in rig.lidars]
     still = rig.with_sensors(*known)
     at_stops = [_at_stops(m, poses) for m, poses in zip(recordings, body, strict=True)]
-    inputs = with_association(replace(inputs_for(still, at_stops), user_rig=rig), WITH_TARGET)
+    inputs = with_association(replace(inputs_for(still, at_stops), user_rig=rig), AT_REST)
     values = values | {(BOARD, "tilt"): np.eye(3)}
     for k in range(len(recordings)):
         values |= {(in_recording(BOARD, k), "tilt"): np.eye(3)}

@@ -344,7 +344,7 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[R
     an implausible rate, or points far from the stamp of their scan.
     """
     what = f"{where} ({stream.name})"
-    stream, notes = checked_stops(stream, what)
+    stream, notes = checked_stops(stream, what, 2)
     for check in (without_repeats, in_order, with_even_stamps, at_even_steps):
         stream, more = check(stream, what)
         notes += more
@@ -359,11 +359,11 @@ def checked_lidar(stream: LidarStream, where: str) -> tuple[LidarStream, tuple[R
     return stream, notes + more
 
 
-def checked_stops(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
-    """`stream` without empty scans, and a note on these. Raises RecordingError naming `what` if fewer than two scans
-    have points."""
+def checked_stops(stream: LidarStream, what: str, fewest: int = 1) -> tuple[LidarStream, tuple[Remark, ...]]:
+    """`stream` without empty scans, and a note on these. Raises RecordingError naming `what` if fewer scans
+    than `fewest` have points."""
     filled = np.diff(stream.start) > 0
-    if filled.sum() < 2:
+    if filled.sum() < fewest:
         raise RecordingError(
             f"{what}: {int(filled.sum())} of {len(filled)} scans have usable points; a calibration needs the "
             "whole recording. Check the driver, and min_range and max_range in the rig file."
