@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -164,3 +164,12 @@ def test_the_median_and_the_worst_image_and_the_fastest_turn_are_shown(moving):
     assert abs(points.seconds - CAMERA_AT_S) < 0.2  # the only images that this scan shows anything in
     assert points.before is None
     assert list(pictures(c, ["lidar0"], [Measurements.of_streams(replace(corners, pictures={}), scan)])) == []
+
+
+def test_one_keyframe_has_its_own_pose_only(moving):
+    path = moving.trajectory
+    one = replace(path, **{f.name: getattr(path, f.name)[80:81] for f in fields(path)})
+    R, p, known = CubicPath.of(replace(moving, trajectory=one)).at(path.seconds[79:83])
+    np.testing.assert_array_equal(known, [False, True, False, False])
+    np.testing.assert_allclose(R, np.repeat(one.rotation, 4, axis=0), atol=1e-12)
+    np.testing.assert_allclose(p, np.repeat(one.position, 4, axis=0))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -65,6 +65,9 @@ class CubicPath:
     @classmethod
     def of(cls, c: Calibration) -> CubicPath:
         path = c.trajectory
+        if len(path.seconds) == 1:  # twice, too far apart to be used between them
+            rotation, position = (np.repeat(x, 2, axis=0) for x in (path.rotation, path.position))
+            path = replace(path, seconds=path.seconds + [0.0, 1.0], rotation=rotation, position=position)
         step = np.diff(path.seconds)
         usable = (np.diff(c.recording_of(path.seconds)) == 0) & (step <= LONGEST_STEP_S)
         between = np.einsum("kji,kjl->kil", path.rotation[:-1], path.rotation[1:])

@@ -259,6 +259,8 @@ class _Album:
 
 def nearest(instants: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """(n,) index of the one of `instants` (m,) at each of `seconds` (n,), at most SAME_IMAGE_S apart; -1: none."""
+    if not len(instants):
+        return np.full(len(seconds), -1)
     order = np.argsort(instants)
     k = order[np.clip(np.searchsorted(instants[order], seconds + SAME_IMAGE_S) - 1, 0, None)]
     return np.where(np.abs(instants[k] - seconds) <= SAME_IMAGE_S, k, -1)
