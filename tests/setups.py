@@ -19,6 +19,7 @@ from icalib.estimate.problem import Problem
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.planes import plane_of
 from icalib.geometry.targets import AprilGrid
+from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
@@ -40,6 +41,7 @@ from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
 TOLERANCE = {
+    "range_offset": 5e-3,
     "gravity": 0.01,
     "rotation": 2e-3,
     "translation": 5e-3,
@@ -320,8 +322,9 @@ class RoomSetup:
         return Problem(self.layout, keyed((imu, lidar)), (), tolerance, framed=False)
 
 
-def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025) -> RoomSetup:
-    """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on."""
+def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025, sheet: bool = False) -> RoomSetup:
+    """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on. sheet: the floor
+    is the sheet of a target at the origin of the world."""
     truth, stream = sim.truth, sim.measurements.lidars[0]
     imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
     count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))
@@ -335,14 +338,21 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     ]
     entries.append((stream.name, "translation", "vector", 3, True))
     entries.append((stream.name, "time_offset", "vector", 1, True))
-    entries.extend((*key, "plane", 3, True) for key in planes)
+    entries.append((stream.name, "range_offset", "vector", 1, sheet))
+    if sheet:
+        assert used[0] == 0, "the first face of a room is its floor"
+        planes = ((BOARD, "tilt"), *planes[1:])
+        entries.append((*planes[0], "tilt", 2, True))
+    entries.extend((*key, "plane", 3, True) for key in planes[sheet:])
     T, origin_s = truth.T_imu_sensor[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
     values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
+    values[stream.name, "range_offset"] = np.zeros(1)
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
     faces = not_none(sim.scenario.room).faces
     for key, k in zip(planes, used, strict=True):
-        values[key] = plane_of(truth.planes[k, :3], faces[k, 0] + 0.5 * (faces[k, 1] + faces[k, 2]))
+        at = plane_of(truth.planes[k, :3], faces[k, 0] + 0.5 * (faces[k, 1] + faces[k, 2]))
+        values[key] = np.eye(3) if key[1] == "tilt" else at
     ends = stream.seconds[[0, -1]] + offset + np.array([0.0, stream.offset_s.max()])
     seconds = place_keyframes(imu, [np.clip(ends, 0.0, imu.seconds[-1])], spacing, 0.5)
     R, p, v = truth.pose_at(seconds + truth.seconds[0])

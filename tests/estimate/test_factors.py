@@ -371,11 +371,19 @@ def feature_sample(
 
 
 def lidar_sample(
-    room, room_of, scheme: Scheme = "inertial", loss: Loss = "none", beam=0.0, imu_free=False, restarts=False, noisy=1.0
+    room,
+    room_of,
+    scheme: Scheme = "inertial",
+    loss: Loss = "none",
+    beam=0.0,
+    imu_free=False,
+    restarts=False,
+    noisy=1.0,
+    sheet=False,
 ):
     """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
-    that of the data sheet the gyroscope's noise is."""
-    setup = room_of(room, imu_free=imu_free, spacing=0.05)
+    that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target."""
+    setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet)
     setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:
         stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))
@@ -448,12 +456,22 @@ def lidar_rows_turned(factor, at, turn):
     poses = poses_at(factor.scheme, times, factor.keyframe, at, factor.imu, factor.gravity, False)
     R = poses.rotation @ so3.exp_many(turn)
     R_lidar, p_lidar = R @ at.values[name, "rotation"], poses.position + R @ at.values[name, "translation"]
-    plane = np.array([at.values[key] for key in factor.planes])[m.plane]
+    values = [at.values[key] for key in factor.planes]
+    plane = np.array(
+        [[*v[:, 2], 0.0, 0.0, 0.0] if key[1] == "tilt" else v for v, key in zip(values, factor.planes, strict=True)]
+    )
+    plane = plane[m.plane]
     normal, point = plane[:, :3], plane[:, 3:]
     distance = np.einsum("ea,ea->e", normal, p_lidar[bin_of] - point)
     distance = np.column_stack([distance, np.einsum("eba,eb->ea", R_lidar[bin_of], normal)])
     L = np.zeros((len(plane), 4, 4))
     L[:, *np.tril_indices(4)] = m.root
+    too_far = at.values[name, "range_offset"][0] - factor.range_offset
+    for e in np.flatnonzero([factor.planes[q][1] == "tilt" for q in m.plane]):  # x - too_far x / |x| at their mean
+        mean, a = L[e, 1:, 0] / L[e, 0, 0], distance[e, 1:].copy()
+        r = np.linalg.norm(mean)
+        to_rest = np.eye(3) - np.outer(mean, mean) / r**2
+        distance[e] -= too_far / r * np.append(a @ mean, to_rest @ a)
     return np.einsum("eji,ej->ei", L, distance), np.einsum("ej,ej->e", m.incidence[:, 1:], distance[:, 1:])
 
 
@@ -784,6 +802,10 @@ SAMPLES = {
     "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
     "shared surfaces": ("PatchFactor", lambda u, s, f: patch_sample()),
     "shared surfaces, huber, curved": ("PatchFactor", lambda u, s, f: patch_sample("huber", True)),
+    "lidar, sheet, noisy gyroscope, beam": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, beam=0.02, noisy=30.0, sheet=True),
+    ),
     "points on boards": ("BoardFactor", lambda u, s, f: board_sample(ON_BOARDS)),
     "edges of boards, huber, curved": ("BoardFactor", lambda u, s, f: board_sample(ON_EDGES, "huber", True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),

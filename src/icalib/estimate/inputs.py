@@ -120,7 +120,7 @@ def layout_for(
     imu, sensors = rig.imu, _taking_part(rig, association)
     entries: list[Entry] = []
     if imu is not None:
-        entries += own_entries(imu, rig, n_recordings)
+        entries += own_entries(imu, rig, n_recordings, association)
         entries += [GRAVITY.entry(WORLD)] if rig.gravity_sigma > 0.0 else []
     # Without an IMU the frame of the target is the world frame of all recordings.
     levelled = imu is not None and not rig.assumes_motion
@@ -128,7 +128,7 @@ def layout_for(
         entries.append(TILT.entry(in_recording(BOARD, k), levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
     for sensor in sensors:
-        entries += own_entries(sensor, rig, n_recordings)
+        entries += own_entries(sensor, rig, n_recordings, association)
     for sensor in sensors:
         entries += model_of(sensor).scene_entries(sensor, rig, n_recordings)
     further = [s.name for s in sensors if s.is_inertial]

@@ -77,8 +77,8 @@ class SensorModel(Generic[S, N]):
 
     # Parameters
 
-    def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig) -> bool:
-        """Whether a parameter group of the sensor is estimated."""
+    def is_estimated(self, sensor: S, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
+        """Whether a parameter group of the sensor is estimated, with points of LiDARs on planes as in `association`."""
         return sensor.is_estimated(spec)
 
     def scene_entries(self, sensor: S, rig: Rig, n_recordings: int) -> list[Entry]:
@@ -156,11 +156,11 @@ def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], 
             yield model, sensors_of_kind
 
 
-def own_entries(sensor: Sensor, rig: Rig, n_recordings: int) -> list[Entry]:
+def own_entries(sensor: Sensor, rig: Rig, n_recordings: int, association: PlaneAssociation) -> list[Entry]:
     """Layout entries of a sensor's parameters. A clock that restarts has a time offset in each recording."""
     model, n_clocks = model_of(sensor), clocks_of(sensor, n_recordings)
     specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
-    return [spec.entry(sensor.name, model.is_estimated(sensor, spec, rig)) for spec in specs]
+    return [spec.entry(sensor.name, model.is_estimated(sensor, spec, rig, association)) for spec in specs]
 
 
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from icalib.base.compiled import njit
-from icalib.optim.state import Entry, Key
-from icalib.rig.scene import PLANE
+from icalib.geometry.targets.base import BOARD
+from icalib.optim.state import Entry, Key, in_recording
+from icalib.rig.scene import PLANE, TILT
 
 MAX_COARSE_POINTS = 3_000_000  # points of a LiDAR that a coarse pass uses, roughly
 MAX_UNTHINNED_PLANE_POINTS = 20_000  # points of a plane: planes with fewer are not thinned
@@ -64,11 +66,15 @@ def thinned(plane: np.ndarray) -> np.ndarray:
 class PlaneAssociation:
     """Index of the plane of each LiDAR point. names (P,): of the planes, different from all sensor names. plane: for
     each LiDAR (N,) int32, plane of each point, -1 for none. at_rest: no planes are estimated, because points lie on the
-    target, or on surfaces that LiDARs share."""
+    target, or on surfaces that LiDARs share.
+
+    sheets: recordings in which points lie on the sheet of the target's reference body. These planes, which are those of
+    the cameras' target, have the numbers from P on."""
 
     names: tuple[str, ...]
     plane: tuple[np.ndarray, ...]
     at_rest: bool = False
+    sheets: tuple[int, ...] = ()
 
     @property
     def count(self) -> int:
@@ -79,6 +85,11 @@ class PlaneAssociation:
     def keys(self) -> tuple[Key, ...]:
         """Keys of the planes' values in a state."""
         return tuple((name, PLANE.name) for name in self.names)
+
+    @property
+    def surfaces(self) -> tuple[Key, ...]:
+        """Keys of what `plane` counts: of the planes, then of the attitudes of the sheets."""
+        return (*self.keys, *((in_recording(BOARD, r), TILT.name) for r in self.sheets))
 
     @property
     def recording(self) -> np.ndarray:
@@ -94,7 +105,17 @@ class PlaneAssociation:
     @property
     def points(self) -> np.ndarray:
         """(P,) number of points on each plane."""
-        return sum((count_points(p, self.count) for p in self.plane), np.zeros(self.count, dtype=np.int64))
+        return self._counts[:, : self.count].sum(axis=0)
+
+    def points_on_sheets(self, lidar: int) -> int:
+        """Number of points of the LiDAR with this index on the sheets."""
+        return int(self._counts[lidar, self.count :].sum())
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        """(L, P + sheets) number of points of each LiDAR on each plane and sheet."""
+        n = self.count + len(self.sheets)
+        return np.array([count_points(p, n) for p in self.plane], dtype=np.int64).reshape(len(self.plane), n)
 
 
 NO_ASSOCIATION = PlaneAssociation((), ())
@@ -108,9 +129,16 @@ def joined_associations(each: Sequence[PlaneAssociation]) -> PlaneAssociation:
         return each[0]
     names = tuple(f"plane {r}.{name.removeprefix('plane ')}" for r, c in enumerate(each, 1) for name in c.names)
     first = np.cumsum([0, *(c.count for c in each)])
+    sheets = tuple(r for r, c in enumerate(each) if c.sheets)
+    number = {r: len(names) + k for k, r in enumerate(sheets)}
     by_lidar = zip(*(c.plane for c in each), strict=True)
     plane = (
-        np.concatenate([np.where(p >= 0, p + n, -1) for p, n in zip(parts, first, strict=False)]).astype(np.int32)
+        np.concatenate(
+            [
+                np.where(p < 0, -1, np.where(p < c.count, p + first[r], number.get(r, -1)))
+                for r, (p, c) in enumerate(zip(parts, each, strict=True))
+            ]
+        ).astype(np.int32)
         for parts in by_lidar
     )
-    return PlaneAssociation(names, tuple(plane))
+    return PlaneAssociation(names, tuple(plane), sheets=sheets)

@@ -220,18 +220,33 @@ class State:
 # Planes of the scene as arrays for compiled kernels.
 
 
+def plane_value(value: np.ndarray) -> np.ndarray:
+    """Plane (6,), normal and point, of the value of a plane, or of a tilt R_world_board (3, 3): z = 0 of the board."""
+    return value if value.ndim == 1 else np.concatenate([value[:, 2], np.zeros(3)])
+
+
 class Planes(NamedTuple):
-    """P planes in the world: unit normal (P, 3), tangents (P, 2, 3) across it, and a point (P, 3) on each [m]. columns
-    (P, 3): calibration columns, -1 where fixed."""
+    """P planes in the world: unit normal (P, 3), its derivatives (P, 2, 3) by the first two parameters, and a point
+    (P, 3) on each [m]. columns (P, 3): calibration columns, -1 where fixed. The third parameter is the distance; for
+    the target, is_target (P,) bool, it is what a LiDAR measures too much, range_offset [m]."""
 
     normal: np.ndarray
     tangents: np.ndarray
     point: np.ndarray
     columns: np.ndarray
+    is_target: np.ndarray
+    range_offset: float
 
     @classmethod
-    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray) -> Planes:
-        """Planes `keys` with their values in `state`."""
-        value = np.array([state.values[key] for key in keys])
-        across = np.array([tangents(v[:3]) for v in value])
-        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns)
+    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray, range_offset: float) -> Planes:
+        """Planes, or tilts of the target, with the keys `keys` and their values in `state`. A tilt turns its plane
+        about x and y of the world."""
+        value = np.array([plane_value(state.values[key]) for key in keys])
+        across = np.array(
+            [
+                tangents(v[:3]) if state.values[key].ndim == 1 else np.cross(np.eye(3)[:2], v[:3])
+                for key, v in zip(keys, value, strict=True)
+            ]
+        )
+        is_target = np.array([state.values[key].ndim == 2 for key in keys])
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, is_target, range_offset)

@@ -16,6 +16,7 @@ from icalib.geometry.targets import Target
 from icalib.model.bodies import Bodies
 from icalib.model.sensor_model import Clusters, Pass, PassEnd, SensorModel, model_of
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
+from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import MERGED_WITHIN_S, instants
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.state import Layout, State
@@ -74,7 +75,7 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
         bodies = choose_bodies(rig.target, recordings, rig.settings.board_shape, rig)
         return [on_common_images(rig, restrict(bodies, recording)) for recording in recordings], bodies
 
-    def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig) -> bool:
+    def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
         """See `SensorModel`. Bloom is estimated only if the target has edges that it shifts.
 
         Without an IMU, time offsets and the extrinsics of the reference camera are not estimated."""

@@ -26,7 +26,9 @@ from typing import ClassVar
 import numpy as np
 
 from icalib.data.measurements import LidarStream
+from icalib.detection.planes import PlaneSearch
 from icalib.errors import EstimationError
+from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import Bodies
 from icalib.model.sensor_model import Pass
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
@@ -35,7 +37,7 @@ from icalib.motion.poses import MERGED_WITHIN_S, instants
 from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
-from icalib.optim.state import Layout, State
+from icalib.optim.state import Layout, State, in_recording
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.spec import RANGE_OFFSET
 
@@ -113,7 +115,7 @@ def in_scene(xyz: np.ndarray, lidar: str, keyframe: np.ndarray, state: State) ->
     return np.einsum("nij,nj->ni", state.rotation[keyframe], on_body) + state.position[keyframe]
 
 
-def on_sheet(points: np.ndarray, outline: np.ndarray, margin_m: float, gate_m: float) -> np.ndarray:
+def on_sheet(points: np.ndarray, outline: np.ndarray, margin_m: float, gate_m: float | np.ndarray) -> np.ndarray:
     """(n,) bool: points (n, 3) in the frame of a body inside the outline of its sheet, grown by margin_m."""
     xy, (low, high) = points[:, :2], outline
     inside = (xy > low - margin_m).all(axis=1) & (xy < high + margin_m).all(axis=1)
@@ -127,6 +129,57 @@ def _hits_sheet(points: np.ndarray, origin: np.ndarray, outline: np.ndarray, gat
     met = origin + (points - origin) * (-origin[2] / height)[:, None]
     near = np.abs(points[:, 2]) < gate_m
     return near & on_sheet(met, outline, -RIM_M, np.inf)
+
+
+# The sheet of the target, whose place images show, in the clouds of a moving LiDAR.
+
+AROUND_SHEET_M = 0.1  # points so near to the sheet belong to no other plane: boards are wider than their print
+THROUGH_SHEET, NEAR_SHEET, ON_SHEET = -1, 1, 2
+
+
+@dataclass(frozen=True)
+class TargetSheet:
+    """The sheet of the target's reference body. rotation (3, 3): R_world_board; outline (2, 2): see
+    `Target.outlines`."""
+
+    rotation: np.ndarray
+    outline: np.ndarray
+
+    @classmethod
+    def of(cls, bodies: Bodies, state: State, recording: int) -> TargetSheet | None:
+        """The sheet in one recording; None if the rig file does not give its size. Then the target may be a wall, a
+        screen, or tags apart from one another."""
+        if not bodies.used or not bodies.target.has_sheet[bodies.used[0]]:
+            return None
+        return cls(state.values[in_recording(BOARD, recording), "tilt"], bodies.target.outlines[bodies.used[0]])
+
+    def is_seen(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch, fewest: int) -> bool:
+        """Whether at least `fewest` points (N, 3) seen from `origins` (N, 3) are on it. If most beams go through it, it
+        is elsewhere."""
+        kinds = self.of_points(points, origins, search)
+        hits, through = (np.count_nonzero(kinds == kind) for kind in (ON_SHEET, THROUGH_SHEET))
+        return bool(hits >= max(fewest, through))
+
+    def others(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> tuple[np.ndarray, np.ndarray]:
+        """Those of points (N, 3) that are neither on the sheet nor beside it, and their `origins`."""
+        far = self.of_points(points, origins, search) <= 0
+        return points[far], origins[far]
+
+    def of_points(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> np.ndarray:
+        """(N,) int8: ON_SHEET for points (N, 3) whose beams from `origins` (N, 3) hit the sheet, NEAR_SHEET for others
+        beside it, THROUGH_SHEET for those behind it, else 0. Where a beam meets the sheet does not depend on its noise,
+        which would move points across the rim. The sheet has a front only, and grazing beams do not count."""
+        origin = origins @ self.rotation.astype(points.dtype)
+        beam = points @ self.rotation.astype(points.dtype) - origin
+        y, length = origin + beam, np.sqrt((beam**2).sum(axis=1))
+        falls = (origin[:, 2] > 0.0) & (-beam[:, 2] > search.least_cosine * length)
+        met = origin - beam * (origin[:, 2] / np.where(falls, beam[:, 2], np.inf))[:, None]
+        gate = search.gate * np.sqrt(search.noise_m**2 + search.position_m**2 + (search.angle_rad * length) ** 2)
+        near = on_sheet(y, self.outline, AROUND_SHEET_M, gate)
+        meets = falls & on_sheet(met, self.outline, -RIM_M, np.inf)
+        return np.select(
+            [meets & near, near, meets & (y[:, 2] < 0.0)], [ON_SHEET, NEAR_SHEET, THROUGH_SHEET], 0
+        ).astype(np.int8)
 
 
 # Where rings of a spinning LiDAR cross the edges of a sheet: half a step beyond the last beam that hits it.

@@ -182,10 +182,24 @@ def _fill_distance(R_lw, p_wl, q, planes, m):
             m[1 + a] += R_lw[a, b] * planes.normal[q, b]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _shorten(row, root, offset, derivative):
+    """Makes coefficients `row` (4,) of (1, x) those of (1, y), y = x - offset x / |x|, linear in x about the mean of
+    the points with moments `root`. Fills derivative (4,), theirs by the offset."""
+    r = np.sqrt(root[1] ** 2 + root[3] ** 2 + root[6] ** 2)
+    u0, u1, u2, per_m = root[1] / r, root[3] / r, root[6] / r, root[0] / r
+    along = u0 * row[1] + u1 * row[2] + u2 * row[3]
+    derivative[0] = -along
+    derivative[1], derivative[2] = per_m * (along * u0 - row[1]), per_m * (along * u1 - row[2])
+    derivative[3] = per_m * (along * u2 - row[3])
+    for c in range(N_WHITENED):
+        row[c] += offset * derivative[c]
+
+
 @njit(cache=True, nogil=True)
-def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
+def _fill_jacobian(R_lw, p_wl, q, planes, m, root, J_distance):
     """Fills J_distance (10, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows) and plane (3
-    rows), then m.
+    rows), then in the distance. root (10,): of the moments of the points.
 
     With a = R^T n the derivatives by the pose are (x cross a; a), because a rotation t of the LiDAR moves x by
     t cross x, and a . (t cross x) = t . (x cross a).
@@ -205,6 +219,10 @@ def _fill_jacobian(R_lw, p_wl, q, planes, m, J_distance):
     A[POSE_DIM + 2, 0] = -1.0
     for c in range(N_WHITENED):
         A[DISTANCE, c] = m[c]
+    if planes.is_target[q]:
+        for i in range(POSE_DIM + 2):
+            _shorten(A[i], root, planes.range_offset, A[POSE_DIM + 2])
+        _shorten(A[DISTANCE], root, planes.range_offset, A[POSE_DIM + 2])
 
 
 @njit(cache=True, nogil=True)
@@ -237,7 +255,8 @@ def _add_pose_gram(J_rows, J_distance, incidence, gram):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
-    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (3,) of its plane.
+    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (3,) of its plane, of
+    which some may be fixed.
 
     J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (3, w): workspace.
     """
@@ -252,16 +271,20 @@ def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
     for h in range(n_chain // KEYFRAME_DIM):
         for r in range(KEYFRAME_DIM):
             for t in range(PLANE_DIM):
-                sums.side[k + h, r, plane_columns[t]] += V[t, KEYFRAME_DIM * h + r]
+                if plane_columns[t] >= 0:
+                    sums.side[k + h, r, plane_columns[t]] += V[t, KEYFRAME_DIM * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
             for t in range(PLANE_DIM):
-                sums.calib[columns[j], plane_columns[t]] += V[t, n_chain + j]
-                sums.calib[plane_columns[t], columns[j]] += V[t, n_chain + j]
+                if plane_columns[t] >= 0:
+                    sums.calib[columns[j], plane_columns[t]] += V[t, n_chain + j]
+                    sums.calib[plane_columns[t], columns[j]] += V[t, n_chain + j]
     for t in range(PLANE_DIM):
         b = B[POSE_DIM + t]
         for c in range(PLANE_DIM + 1):
             d, other = B[POSE_DIM + c], n_b if c == PLANE_DIM else plane_columns[c]
+            if plane_columns[t] < 0 or other < 0:
+                continue
             s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
             sums.calib[plane_columns[t], other] += s
             if c == PLANE_DIM:
@@ -275,8 +298,9 @@ def _add_plane_incidence(J_distance, incidence, plane_columns, sums):
     for t in range(PLANE_DIM):
         J = J_distance[POSE_DIM + t]
         s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
-        sums.calib[plane_columns[t], n_b] += s
-        sums.calib[n_b, plane_columns[t]] += s
+        if plane_columns[t] >= 0:
+            sums.calib[plane_columns[t], n_b] += s
+            sums.calib[n_b, plane_columns[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -342,11 +366,13 @@ def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
     _fill_distance(R_lw, p_wl, bins.plane[e], planes, m)
     for c in range(N_WHITENED):
         work.J_distance[0, c] = m[c]
+    if planes.is_target[bins.plane[e]]:
+        _shorten(work.J_distance[0], bins.root[e], planes.range_offset, work.J_distance[1])
     _times_root(work.J_distance, bins.root[e], rows[e : e + 1])
     cost = incidence[e, 0]
     for c in range(N_WHITENED):
         cost += 0.5 * rows[e, c] ** 2
-        cost += incidence[e, c] * m[c] if c else 0.0
+        cost += incidence[e, c] * work.J_distance[0, c] if c else 0.0
     return cost
 
 
@@ -364,7 +390,7 @@ def linearise_noise(bins, at, columns, planes):
         fill_imu_pose(i, at, J_imu_pose)
         for e in range(bins.start[i], bins.start[i + 1]):
             _fill_distance(R_lw, p_wl, bins.plane[e], planes, work.m)
-            _fill_jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, A)
+            _fill_jacobian(R_lw, p_wl, bins.plane[e], planes, work.m, bins.root[e], A)
             _times_root(A, bins.root[e], B[:POSE_DIM])
             for a in range(3):
                 for j in range(POSE_DIM):
@@ -381,12 +407,12 @@ def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise,
     plane_columns, A, B = planes.columns[q], work.J_distance, work.J_rows
     cost = _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows)
     if wanted:
-        _fill_jacobian(R_lw, p_wl, q, planes, work.m, A)
+        _fill_jacobian(R_lw, p_wl, q, planes, work.m, bins.root[e], A)
         _times_root(A, bins.root[e], B)
         _add_pose_gram(B, A, bins.incidence[e], work.gram)
     if has_noise:
         add_entry_noise(bins.J_rows_noise[e], bins.J_incidence_noise[e], rows[e], B, work.gram_noise, noise)
-    if wanted and plane_columns[0] >= 0:
+    if wanted and max(plane_columns[0], plane_columns[2]) >= 0:
         _add_plane(k, B, work.J_pose, columns, plane_columns, sums, work.V)
         _add_plane_incidence(A, bins.incidence[e], plane_columns, sums)
         if has_noise:

@@ -11,7 +11,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel
 from icalib.motion.factor import Factor, Whitened, pairs_of
-from icalib.motion.point_planes import thinned
+from icalib.motion.point_planes import PlaneAssociation, thinned
 from icalib.optim.state import Key
 from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
@@ -30,10 +30,13 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     """Sensor model of a LiDAR, used once planes are known. Stated noise is along the beam; estimated noise is
     isotropic."""
 
-    def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig) -> bool:
+    def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
         """See `SensorModel`. Only sheets whose distance is known from images show a range offset."""
-        at_rest = rig.imu is None and rig.has_target
-        return super().is_estimated(sensor, spec, rig) and (spec is not RANGE_OFFSET or at_rest)
+        observable = spec is not RANGE_OFFSET or (association.at_rest and rig.has_target)
+        if association.sheets:
+            k = [x.name for x in rig.lidars].index(sensor.name)
+            observable = observable or association.points_on_sheets(k) > 0
+        return observable and super().is_estimated(sensor, spec, rig, association)
 
     def keyframe_times(
         self, sensors: Sequence[Lidar], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]
@@ -84,7 +87,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
-        yield LidarFactor.build(stream, used, at.association.keys, at.motion, noise, at.layout, scheme, bin_s)
+        yield LidarFactor.build(stream, used, at.association.surfaces, at.motion, noise, at.layout, scheme, bin_s)
 
     def joint_factors(
         self, sensors: Sequence[Lidar], factors: Sequence[Factor], noise: Mapping[str, LidarNoise], at: Pass
@@ -97,7 +100,8 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     def points_on_planes(self, sensor: Lidar, stream: LidarStream, at: Pass) -> tuple[np.ndarray, np.ndarray]:
         """See `binning.points_on_planes`."""
         assert at.motion is not None
-        return points_on_planes(at.motion, stream, _plane(sensor, at))
+        plane = _plane(sensor, at)
+        return points_on_planes(at.motion, stream, np.where(plane < at.association.count, plane, -1))
 
 
 def _on_boards(sensor: Lidar, noise: LidarNoise, factor: BoardFactor, out: Whitened) -> LidarNoise:

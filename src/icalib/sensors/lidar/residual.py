@@ -10,7 +10,7 @@ residuals of each plane in a bin, which are equivalent to the residuals of all p
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -23,13 +23,28 @@ from icalib.motion.poses import EstimatedMotion as ImuMotion
 from icalib.motion.poses import assign_keyframes, instants, offset_at, slices_by_clock
 from icalib.motion.sensor_pose import Kinematics, SensorPose
 from icalib.optim.arrowhead import Piece, in_parallel
-from icalib.optim.state import Key, Layout, Planes, State
+from icalib.optim.state import Key, Layout, Planes, State, plane_value
 from icalib.rig import Scheme
+from icalib.rig.scene import TILT
 from icalib.sensors.lidar import kernels
 from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
+from icalib.sensors.lidar.spec import RANGE_OFFSET
 
 BINS_PER_CHUNK = 512  # poses and Jacobians of so many bins fit the processor cache
+
+
+def range_offset(state: State, lidar: str) -> float:
+    """How much too far the LiDAR measures [m]; 0 in a state without this parameter, as that of its odometry."""
+    return float(state.values.get((lidar, RANGE_OFFSET.name), [0.0])[0])
+
+
+def less_offset(stream: LidarStream, state: State) -> LidarStream:
+    """The stream with corrected ranges."""
+    offset = np.float32(range_offset(state, stream.name))
+    if offset == 0.0:
+        return stream
+    return replace(stream, xyz=stream.xyz * (1.0 - offset / np.linalg.norm(stream.xyz, axis=1, keepdims=True)))
 
 
 @dataclass(frozen=True)
@@ -38,7 +53,8 @@ class LidarFactor(RowFactor):
 
     keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
     J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
-    in the values of a state, of the planes of the moments.
+    in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Ranges
+    are less range_offset [m]; its changes within a pass act on the sheet alone, which shows it.
     """
 
     name: str
@@ -48,6 +64,7 @@ class LidarFactor(RowFactor):
     J_rows_noise: np.ndarray
     J_incidence_noise: np.ndarray
     planes: tuple[Key, ...]
+    range_offset: float
     imu: ImuData
     gravity: float
     scheme: Scheme
@@ -68,8 +85,10 @@ class LidarFactor(RowFactor):
     ) -> LidarFactor:
         """The factor of a pass that starts from `motion`. plane (N,) int32: index of each point into `planes`, -1:
         none. Raises EstimationError if no point is left."""
-        values = np.array([motion.state.values[p] for p in planes])
-        moments = take_moments(AssociatedPoints(stream, plane, values), motion, noise, bin_s)
+        values = np.array([plane_value(motion.state.values[p]) for p in planes])
+        offset = range_offset(motion.state, stream.name)
+        cloud = AssociatedPoints(less_offset(stream, motion.state), plane, values)
+        moments = take_moments(cloud, motion, noise, bin_s)
         times = instants(stream, motion.state.values, moments.seconds)
         keyframe = assign_keyframes(scheme, motion.state.seconds, times, motion.imu.forwards)
         noise_angle = motion.imu.rotation_sigma(motion.state.seconds[keyframe], times)
@@ -79,8 +98,8 @@ class LidarFactor(RowFactor):
         J_incidence = np.zeros((len(moments.plane), 3), np.float32)
         n = len(motion.state.seconds)
         factor = cls(
-            stream.name, moments, keyframe, noise_angle, J_rows, J_incidence, planes, motion.imu, motion.gravity,
-            scheme, layout, n,
+            stream.name, moments, keyframe, noise_angle, J_rows, J_incidence, planes, offset, motion.imu,
+            motion.gravity, scheme, layout, n,
         )  # fmt: skip
         factor._linearise_noise(motion.state)
         return factor
@@ -97,8 +116,11 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _plane_columns(self) -> np.ndarray:
-        """(P, 3) calibration columns of each plane."""
-        return np.array([self.layout.block(*p).columns for p in self.planes])
+        """(P, 3) calibration columns of each plane, see `Planes`."""
+        last = {TILT.name: ((self.name, RANGE_OFFSET.name),)}
+        return np.array(
+            [np.concatenate([self.layout.block(*key).columns for key in (p, *last.get(p[1], ()))]) for p in self.planes]
+        )
 
     @property
     def key(self) -> FactorKey:
@@ -135,7 +157,8 @@ class LidarFactor(RowFactor):
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, SensorPose, np.ndarray, Planes]]:
         """Yields bins b0:b1 in chunks, with poses of the LiDAR, their calibration columns (c,), and the planes."""
-        planes, m = Planes.of(self.planes, state, self._plane_columns), self.moments
+        offset, m = range_offset(state, self.name) - self.range_offset, self.moments
+        planes = Planes.of(self.planes, state, self._plane_columns, offset)
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
         for columns, a, b in self._chunk_ends(state, kinematics, b0, b1):
             keyframe, noise = self.keyframe[a:b], (self.J_rows_noise, self.J_incidence_noise)

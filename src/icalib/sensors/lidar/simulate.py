@@ -1,4 +1,4 @@
-"""Simulated LiDARs: points of the room, each measured from the pose of the sensor at the instant of the point."""
+"""Simulated LiDARs: points of the room and its boards, each measured from the pose of the sensor at its instant."""
 
 from __future__ import annotations
 
@@ -86,14 +86,16 @@ class SimLidar(SimSensor):
         xyz = np.empty((len(stamps) * self.points, 3), dtype=np.float32)  # unused memory pages are never allocated
         offset, plane = np.empty(len(xyz), dtype=np.float32), np.empty(len(xyz), dtype=np.int32)
         column_s = 1.0 / (self.rate_hz * self.azimuth_steps)
+        surfaces = scene.room.surfaces_with(scene.sheets)
         for i, begin in enumerate(seconds):
             noise = noise_m * np.random.default_rng([*seed, i]).standard_normal((self.azimuth_steps, self.rings))
             turn = _turn(self, scene.trajectory, begin, noise)
             free = slice(start[i], None)
             into = _Points(xyz[free], offset[free], plane[free])
-            start[i + 1] = start[i] + _fill_points(scene.room.surfaces, turn, column_s, into)
+            start[i + 1] = start[i] + _fill_points(surfaces, turn, column_s, into)
             progress((i + 1) / len(seconds))
         n = start[-1]
+        plane[:n][plane[:n] >= len(scene.room.faces)] = -1  # boards are no planes of the room
         return Report(LidarStream(self.name, stamps, start, offset[:n], xyz[:n], plane[:n]))
 
     def rig_entry(self) -> Lidar:

@@ -119,7 +119,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
     progress("images", 0.1)
     corners, corner_truth = _corners(scenario, trajectory, seed)
     followed = _tracks(scenario, trajectory, seed)
-    scene = SimScene(trajectory, seconds, scenario.duration_s, scenario.room, scenario.robot_noise_enabled)
+    noisy = scenario.robot_noise_enabled
+    scene = SimScene(trajectory, seconds, scenario.duration_s, scenario.room, noisy, scenario.sheets)
     reports = _reports(scenario, scene, seed, progress)
     truth = Truth(
         **_motion_truth(scenario, trajectory, seconds[kept]),

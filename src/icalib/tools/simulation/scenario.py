@@ -31,13 +31,15 @@ BagEvent = tuple[int, Callable[[BagWriter], Any]]  # instant of reception on the
 @dataclass(frozen=True, eq=False)
 class SimScene:
     """The world that sensors measure. trajectory: of the IMU; imu_seconds (N,): instants of its readings on its clock
-    since the origin; noisy: whether sensors have noise."""
+    since the origin; noisy: whether sensors have noise; sheets (n, 4, 3): faces of boards in the room, as `Room.faces`.
+    """
 
     trajectory: TrueTrajectory
     imu_seconds: np.ndarray
     duration_s: float
     room: Room | None
     noisy: bool
+    sheets: np.ndarray = field(default_factory=lambda: np.empty((0, 4, 3)))
 
 
 class Report(NamedTuple):
@@ -475,6 +477,19 @@ class Scenario:
     def body_poses(self) -> np.ndarray:
         """(bodies, 4, 4) T_world_body."""
         return self.T_world_board[None] if self.T_world_bodies is None else self.T_world_bodies
+
+    @property
+    def sheets(self) -> np.ndarray:
+        """(n, 4, 3) both sides of the boards whose `sheet` is given, in the form of `Room.faces`."""
+        faces = []
+        for T, (low, high), has_sheet in zip(
+            self.body_poses, self.target_size * self.target.outlines, self.target.has_sheet, strict=True
+        ):
+            along, across = (high - low)[:, None] * T[:3, :2].T
+            if self.board and has_sheet:
+                corner = T[:3, :2] @ low + T[:3, 3]
+                faces += [(corner, along, across, np.zeros(3)), (corner, across, along, np.zeros(3))]
+        return np.array(faces).reshape(-1, 4, 3)
 
     @property
     def mounted(self) -> tuple[SimCamera | SimSensor, ...]:

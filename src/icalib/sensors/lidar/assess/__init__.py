@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -18,15 +19,15 @@ from icalib.geometry.planes import plane_of
 from icalib.motion.factor import of_type
 from icalib.motion.poses import instants, usable
 from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
-from icalib.optim.state import State
+from icalib.optim.state import State, plane_value
 from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, times
 from icalib.rig import Lidar, Rig
-from icalib.sensors.lidar.assess.boards import on_boards
+from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes
 from icalib.sensors.lidar.assess.patches import on_patches
 from icalib.sensors.lidar.binning import LidarNoise, in_world
-from icalib.sensors.lidar.residual import LidarFactor
+from icalib.sensors.lidar.residual import LidarFactor, less_offset
 from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
@@ -47,7 +48,7 @@ def assess(a: AssessedEstimate) -> Assessment:
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=notes(a.inputs, a.estimate, a.timeline),
+        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a)),
         warnings=warnings(a.inputs, a.estimate),
     )
 
@@ -59,6 +60,7 @@ def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
     points = association.points if association.count else ()
     for name, v, n in zip(association.names, values, points, strict=True):
         yield Plane(name, v[:3].copy(), v[3:].copy(), int(n))
+    yield from sheet_planes(inputs, state)
 
 
 def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[LidarResiduals]:
@@ -67,7 +69,7 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
         return
     state = estimate.outcome.state
     now, guess = motion_of(inputs, state), motion_of(inputs, inputs.guess or state)
-    values = np.array([state.values[key] for key in inputs.association.keys])
+    values = np.array([plane_value(state.values[key]) for key in inputs.association.surfaces])
     thinned = [_thinned(inputs, k, state) for k in range(len(inputs.rig.lidars))]
     before = [in_world(guess, stream) for stream, _ in thinned]
     first_planes = _fitted_planes(
@@ -97,14 +99,15 @@ def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterato
 
 
 def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.ndarray]:
-    """Points of a LiDAR on planes while the IMU was running, evenly thinned, and the plane (N,) of each."""
+    """Points of a LiDAR on planes while the IMU was running, evenly thinned, with corrected ranges; and the plane (N,)
+    of each."""
     assert inputs.imu is not None
     stream, plane = inputs.measurements.lidars[index], inputs.association.plane[index]
     points = np.flatnonzero(plane >= 0)
     points = points[:: max(1, -(-len(points) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
     one = stream.numbered(points)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
-    return one.numbered(np.flatnonzero(running)), plane[points[running]]
+    return less_offset(one.numbered(np.flatnonzero(running)), state), plane[points[running]]
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:
@@ -205,7 +208,8 @@ def _time_stretch(inputs: Inputs, estimate: Estimate, index: int) -> tuple[float
     a scan is removed, as a time offset absorbs it.
     """
     state = estimate.outcome.state
-    motion, values = motion_of(inputs, state), np.array([state.values[key] for key in inputs.association.keys])
+    motion = motion_of(inputs, state)
+    values = np.array([plane_value(state.values[key]) for key in inputs.association.surfaces])
     stream, plane = _thinned(inputs, index, state)
     if len(plane) < MIN_FITTED_POINTS:
         return 0.0, np.inf

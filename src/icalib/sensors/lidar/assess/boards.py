@@ -1,4 +1,4 @@
-"""Assessment of LiDARs whose points lie on the target that cameras see, standing still."""
+"""Assessment of LiDARs whose points lie on the target that cameras see, standing still or in motion."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from icalib.base.remark import Remark
+from icalib.estimate.inputs import Inputs
 from icalib.observability.assessor import AssessedEstimate, Assessment
-from icalib.optim.state import State
+from icalib.optim.state import State, in_recording
 from icalib.result.calibration import Plane
 from icalib.rig import ParameterSpec
 from icalib.sensors.lidar.board_factor import GATE_SIGMAS, ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints, in_scene
@@ -80,14 +81,19 @@ def _notes(a: AssessedEstimate) -> Iterator[Remark]:
             "lidar_points_on_target",
             f"{len(f.sigma)} points of {f.name} lie on the target, at {stops} of {all_stops} stops; noise {size}.",
         )
-        offset, sigma = _value(a, f.name, RANGE_OFFSET)
-        if abs(offset) > max(SIGNIFICANT_SIGMAS * sigma, RANGE_OFFSET.prior_sigma / 10.0):
-            yield Remark(
-                "ranges_offset",
-                f"{f.name} measures {1e3 * abs(offset):.0f} +- {1e3 * sigma:.0f} mm too "
-                f"{'far' if offset > 0.0 else 'near'}; its extrinsics are those of corrected ranges, so correct the "
-                "ranges where you use them, too.",
-            )
+        yield from ranges_offset(a, f.name)
+
+
+def ranges_offset(a: AssessedEstimate, lidar: str) -> Iterator[Remark]:
+    """The note on ranges that are significantly too long or too short."""
+    offset, sigma = _value(a, lidar, RANGE_OFFSET)
+    if abs(offset) > max(SIGNIFICANT_SIGMAS * sigma, RANGE_OFFSET.prior_sigma / 10.0):
+        yield Remark(
+            "ranges_offset",
+            f"{lidar} measures {1e3 * abs(offset):.0f} +- {1e3 * sigma:.2g} mm too "
+            f"{'far' if offset > 0.0 else 'near'}; its extrinsics are those of corrected ranges, so correct the "
+            "ranges where you use them, too.",
+        )
 
 
 def _wrong_sheets(a: AssessedEstimate) -> Iterator[Remark]:
@@ -114,3 +120,36 @@ def _value(a: AssessedEstimate, lidar: str, spec: ParameterSpec) -> tuple[float,
     """Value and standard deviation of a number of the LiDAR; 0 and infinity if it is not estimated."""
     group = next((g for g in a.groups if (g.sensor, g.name) == (lidar, spec.name) and g.columns is not None), None)
     return (0.0, np.inf) if group is None else (float(group.value[0]), float(group.std[0]))
+
+
+# In motion.
+
+
+def sheet_planes(inputs: Inputs, state: State) -> Iterator[Plane]:
+    """The sheet in each recording, with its number of points. Its numbers follow those of the planes."""
+    association, bodies = inputs.association, inputs.bodies
+    for k, r in enumerate(association.sheets):
+        tilt = state.values[association.surfaces[association.count + k]]
+        middle = np.append(bodies.target.outlines[bodies.used[0]].mean(axis=0), 0.0)
+        points = int(sum((p == association.count + k).sum() for p in association.plane))
+        yield Plane(in_recording("sheet", r), tilt[:, 2].copy(), tilt @ middle, points)
+
+
+def sheet_notes(a: AssessedEstimate) -> Iterator[Remark]:
+    """The number of points on the sheet whose size the rig file gives, and the offset of ranges that they show."""
+    association, bodies = a.inputs.association, a.inputs.bodies
+    if not association.count or not bodies.used or not bodies.target.has_sheet[bodies.used[0]]:
+        return
+    for k, lidar in enumerate(a.inputs.rig.lidars):
+        if points := association.points_on_sheets(k):
+            yield Remark(
+                "lidar_points_on_sheet",
+                f"{points} points of {lidar.name} lie on the target; its place is that in the images.",
+            )
+            yield from ranges_offset(a, lidar.name)
+        else:
+            yield Remark(
+                "target_unseen_by_lidar",
+                f"the target is not in the clouds of {lidar.name}, so that only planes of the scene calibrate it; hold "
+                "the LiDAR so that it sees the target, too.",
+            )

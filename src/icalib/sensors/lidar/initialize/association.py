@@ -51,9 +51,11 @@ from icalib.sensors.lidar.binning import (
     in_world,
     take_moments,
 )
+from icalib.sensors.lidar.board_factor import ON_SHEET, TargetSheet
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
+from icalib.sensors.lidar.residual import less_offset
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 # The rounds diverge if the share of points on planes falls below both: a share of all points, and a ratio to the share
@@ -150,7 +152,8 @@ def _associated(
     associations = []
     for r, streams in enumerate(points_by_recording(inputs)):
         with naming_recording(inputs, r):
-            associations.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r]))
+            sheet = TargetSheet.of(inputs.bodies, state, r) if k else None  # the first round registers the clouds
+            associations.append(associate(streams, motion_of(inputs, state), round_search(k, noise), before[r], sheet))
     association = joined_associations([a.association for a in associations])
     planes = np.concatenate([a.planes for a in associations])
     values = _without_planes(state) | dict(zip(association.keys, planes, strict=True))
@@ -184,7 +187,7 @@ def _unthinned(
 
 def _share_on_planes(association: PlaneAssociation) -> float:
     """Share of the points that lie on planes."""
-    return float(association.points.sum() / max(sum(len(p) for p in association.plane), 1))
+    return float(sum((p >= 0).sum() for p in association.plane) / max(sum(len(p) for p in association.plane), 1))
 
 
 def check_shares(shares: Sequence[float], names: str) -> None:
@@ -355,13 +358,20 @@ def round_search(k: int, noise_m: float) -> PlaneSearch:
 
 
 def associate(
-    streams: Sequence[LidarStream], motion: EstimatedMotion, search: PlaneSearch, before: AssociatedPlanes | None = None
+    streams: Sequence[LidarStream],
+    motion: EstimatedMotion,
+    search: PlaneSearch,
+    before: AssociatedPlanes | None = None,
+    sheet: TargetSheet | None = None,
 ) -> AssociatedPlanes:
     """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
-    shares most points. Raises EstimationError if there is no plane."""
+    shares most points. Points on the `sheet` are on no other plane. Raises EstimationError if there is no plane."""
+    streams = [less_offset(s, motion.state) for s in streams]
     step = odd_step(sum(len(s.xyz) for s in streams))
     thinned = [in_world(motion, _every(step, s)) for s in streams]
-    points, origins = zip(*thinned, strict=True)
+    sheets = [sheet if sheet and sheet.is_seen(*cloud, search, MIN_PLANE_POINTS) else None for cloud in thinned]
+    others = [c if s is None else s.others(*c, search) for s, c in zip(sheets, thinned, strict=True)]
+    points, origins = zip(*others, strict=True)
     planes = find_planes(np.concatenate(points), np.concatenate(origins), search)
     if not planes.count:
         names = " and ".join(s.name for s in streams)
@@ -369,8 +379,9 @@ def associate(
             f"{names} saw no flat surface of {search.smallest_m2} m^2 or more; record among walls and floors, "
             "or check the point times."
         )
-    plane = tuple(_plane_of_points(planes, motion, s, search) for s in streams)
-    association = PlaneAssociation(_plane_names(planes.count, plane, before and before.association), plane)
+    plane = tuple(_plane_of_points((planes, on), motion, s, search) for s, on in zip(streams, sheets, strict=True))
+    names = _plane_names(planes.count, plane, before and before.association)
+    association = PlaneAssociation(names, plane, sheets=(0,) if any(sheets) else ())
     return AssociatedPlanes(association, planes.planes.copy(), _doubled(planes, thinned, search))
 
 
@@ -404,14 +415,22 @@ def odd_step(points: int, most: int = MOST_POINTS) -> int:
 
 
 def _plane_of_points(
-    planes: ExtractedPlanes, motion: EstimatedMotion, stream: LidarStream, search: PlaneSearch
+    surfaces: tuple[ExtractedPlanes, TargetSheet | None],
+    motion: EstimatedMotion,
+    stream: LidarStream,
+    search: PlaneSearch,
 ) -> np.ndarray:
-    """(N,) int32 plane of each point, -1: none; see `ExtractedPlanes.of_points`. The points are moved to the world
-    group by group, which bounds the memory."""
-    plane = np.full(len(stream.xyz), -1, np.int32)
+    """(N,) int32 plane of each point, -1: none; see `ExtractedPlanes.of_points`. The sheet has the number after the
+    planes. The points are moved to the world group by group, which bounds the memory."""
+    plane, (planes, sheet) = np.full(len(stream.xyz), -1, np.int32), surfaces
 
     def number(group: slice, points: np.ndarray, origins: np.ndarray) -> None:
-        plane[group] = planes.of_points(points, origins, search)
+        of_point = planes.of_points(points, origins, search)
+        if sheet is not None:
+            kinds = sheet.of_points(points, origins, search)
+            of_point[kinds > 0] = -1
+            of_point[kinds == ON_SHEET] = planes.count
+        plane[group] = of_point
 
     each_in_world(motion, stream, number)
     return plane
@@ -424,7 +443,7 @@ def _plane_names(count: int, plane: tuple[np.ndarray, ...], before: PlaneAssocia
         return tuple(f"plane {k}" for k in range(count))
     shared = np.zeros((count, len(before.names)), dtype=np.int64)
     for now, then in zip(plane, before.plane, strict=True):
-        both = (now >= 0) & (then >= 0)
+        both = (now >= 0) & (now < count) & (then >= 0) & (then < len(before.names))
         shared += np.bincount(now[both] * np.int64(len(before.names)) + then[both], minlength=shared.size).reshape(
             shared.shape
         )
