@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from icalib.cli import main
@@ -134,6 +136,45 @@ def test_points_of_scans_lie_where_the_truth_puts_them(found, shown):
         known = (seconds - late >= path.seconds[0]) & (seconds - late <= path.seconds[-1])
         error = np.array(rows.values["Points3D:positions"][k]) - (turn.apply(points) + shift)[known]
         assert np.linalg.norm(error, axis=1).max() < MOST_OFF_M
+
+
+def _most_off_px(shown, pixels: list, seconds: float, world: np.ndarray) -> float:
+    """95th percentile of the distance [px] from pixels of Rerun, which it counts from the corner of the image, to the
+    nearest of the points `world` (n, 3) of the simulated world, at an instant of the result."""
+    truth, camera = shown.simulation.truth, shown.simulation.scenario.cameras[0]
+    late = (int(shown.simulation.measurements.imu.stamps_ns[0]) - truth.imu_clock_origin_ns) * 1e-9
+    fx, fy, cx, cy = camera.intrinsics
+    (R,), (p,), _ = truth.pose_at(np.array([seconds + late]))
+    T, K = truth.T_imu_sensor["cam0"], np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    in_camera = ((world - p) @ R - T[:3, 3]) @ T[:3, :3]
+    ahead = in_camera[in_camera[:, 2] > 0.3]
+    uv = cv2.projectPoints(ahead, np.zeros(3), np.zeros(3), K, np.array(camera.distortion))[0][:, 0] + 0.5
+    return float(np.quantile(KDTree(uv).query(np.array(pixels))[0], 0.95))
+
+
+def test_points_of_scans_lie_in_images_where_the_truth_has_them(found, shown):
+    m, rows = shown.simulation.measurements, found[f"{IMAGE}/lidar0"]
+    seconds = (m.lidars[0].stamps_ns - m.imu.stamps_ns[0]) * 1e-9
+    for k in (8, 20, 33):
+        scan = int(np.argmin(np.abs(seconds - rows.seconds[k])))
+        world = np.concatenate([_true_points(shown, s)[0] for s in (scan - 1, scan, scan + 1)])
+        pixels = rows.values["Points2D:positions"][k]
+        assert len(pixels) > 300
+        assert _most_off_px(shown, pixels, rows.seconds[k], world) < 1.5  # 6 mm at 2 m
+
+
+def test_outlines_of_the_target_lie_in_images_where_the_truth_has_them(found, shown):
+    (x0, y0), (x1, y1) = shown.simulation.scenario.target.outlines[0]
+    along = np.linspace(0.0, 1.0, 5000)[:, None]
+    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0], [x0, y0, 0.0]])
+    sheet = np.concatenate([a + along * (b - a) for a, b in pairwise(corners)])
+    T, rows = shown.simulation.truth.T_world_board, found[f"{IMAGE}/target"]
+    strips = rows.values["LineStrips2D:strips"]
+    drawn = [k for k in range(len(strips)) if strips[k]]
+    assert len(drawn) > 10
+    for k in drawn[::10]:
+        pixels = [uv for strip in strips[k] for uv in strip]
+        assert _most_off_px(shown, pixels, rows.seconds[k], sheet @ T[:3, :3].T + T[:3, 3]) < 1.5
 
 
 def test_lines_hold_what_the_result_holds(found, shown):
