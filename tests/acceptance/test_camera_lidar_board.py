@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from tests.typed import not_none
 
 from icalib.cli import main
 from icalib.data.measurements import Measurements
 from icalib.pipeline import calibrate_measurements, measure
+from icalib.result import Calibration
 from icalib.rig.file import load_rig
 
 pytestmark = pytest.mark.slow
@@ -43,8 +46,12 @@ def recorded(camera_lidar_board, reference, tmp_path_factory):
     return rig, measurements
 
 
-def lidar_pose(rig, measurements) -> LidarPose:
-    result = calibrate_measurements(rig, measurements)
+@pytest.fixture(scope="module")
+def result(recorded) -> Calibration:
+    return calibrate_measurements(*recorded)
+
+
+def lidar_pose(result: Calibration) -> LidarPose:
     rotation, translation = result.group("lidar0", "rotation"), result.group("lidar0", "translation")
     return LidarPose(np.column_stack([rotation.value, translation.value]), rotation.std, translation.std)
 
@@ -72,17 +79,34 @@ def test_the_draft_has_a_fisheye_and_a_lidar(recorded):
     assert rig.cameras[0].model == "pinhole-equidistant"
 
 
-def test_the_pose_is_the_published_one(recorded, reference):
-    pose = lidar_pose(*recorded)
+def test_the_pose_is_the_published_one(result, reference):
+    pose = lidar_pose(result)
     turn, shift = apart(pose.T, np.array(reference["T_cam_lidar_published"]))
     assert np.rad2deg(np.linalg.norm(turn)) < 0.6
     assert np.linalg.norm(shift) < 0.03
 
 
+def test_points_of_the_board_are_within_its_outline(result):
+    """Of the two stops that the report shows. The LiDAR sees past the board what it hides from the camera, metres
+    farther; near points outside are those of its stand, and beams that its edge cuts."""
+    corners, points = (tuple(x for x in result.pictures if bool(x.sensor) is shown) for shown in (False, True))
+    assert [len(corners), len(points)] == [2, 2]
+    for picture in points:
+        assert picture.file.endswith(".jpg")
+        after = not_none(picture.after)
+        outline = picture.outline[~np.isnan(picture.outline[:, 0])].astype(np.float32)
+        depth_px = np.array([cv2.pointPolygonTest(outline, (float(u), float(v)), True) for u, v in after.uv])
+        farther = after.distance - np.median(after.distance[depth_px > 0])
+        on_board = np.abs(farther) < 0.3
+        assert (on_board & (depth_px > 0)).sum() > 100
+        assert (on_board | (farther > 1.0))[depth_px > 0].all()
+        assert np.mean(depth_px[on_board & (depth_px > -40)] > 0) > 0.9
+
+
 @pytest.mark.full
 def test_halves_agree(recorded):
     rig, measurements = recorded
-    even, odd = (lidar_pose(rig, stops(measurements, slice(k, None, 2))) for k in range(2))
+    even, odd = (lidar_pose(calibrate_measurements(rig, stops(measurements, slice(k, None, 2)))) for k in range(2))
     turn, shift = apart(even.T, odd.T)
     assert np.rad2deg(np.linalg.norm(turn)) < 0.3
     assert np.linalg.norm(shift) < 0.015
