@@ -126,6 +126,12 @@ def camera_lidar_board() -> Path:
 
 
 @pytest.fixture(scope="session")
+def three_lidars_car() -> Path:
+    """Clouds of three LiDARs on a standing car, in three scenes."""
+    return _recording("three_lidars_car")
+
+
+@pytest.fixture(scope="session")
 def odometry_logs() -> Path:
     """Rates, poses of a LiDAR odometry and IMU readings of two rigs, as LI-Init logged them, and its results."""
     return _recording("lidar_imu_odometry")

@@ -46,6 +46,7 @@ ON_PATCHES = "points on shared surfaces"  # kind of residuals
 GATE_SIGMAS = 4.0  # largest distance of a used point from its patch, in standard deviations of the noise
 USUAL_WEIGHT = 10.0  # points: weight of the usual variance in that of a patch, whose few points estimate it badly
 FLATNESS_M, FLATNESS_STEP = (1e-4, 0.2), 1.05  # range of flatness, and relative accuracy
+MIN_SIGMA_M = 1e-3  # of points: keeps weights of simulated points without noise finite
 LEAST_SPREAD = 1e-6  # of moments, relative to the largest: directions along a patch in which a LiDAR has no extent
 
 
@@ -129,8 +130,8 @@ class PatchRows:
 
     @classmethod
     def of(cls, points: PatchPoints, names: tuple[str, ...], state: State, sigma: float, flatness: float) -> PatchRows:
-        """The rows at `state`. sigma, flatness [m]: usual standard deviation of a point, and of the planes that LiDARs
-        see from the plane of the patch."""
+        """The rows at `state`. sigma, flatness [m]: standard deviations of a point, if no patch shows it, and of the
+        planes that LiDARs see from the plane of the patch."""
         P, L = len(points.keyframe), len(names)
         body, origin = points.in_body(names, state)
         normal, centre = points.planes(body)
@@ -147,15 +148,17 @@ class PatchRows:
         along = np.einsum("cij,cj->ci", whitening, _sums(cell, P * L, A * off[:, None]))
         squares = _sums(cell, P * L, off[:, None] ** 2)[:, 0] - (along**2).sum(axis=1)
         dof = np.maximum(inner[:, 0, 0] - 3.0, 0.0)
-        variance = (np.maximum(squares, 0.0) + USUAL_WEIGHT * sigma**2) / (dof + USUAL_WEIGHT)
+        squares = np.maximum(squares, MIN_SIGMA_M**2 * dof)
+        usual = squares.sum() / dof.sum() if dof.any() else sigma**2
+        variance = (squares + USUAL_WEIGHT * usual) / (dof + USUAL_WEIGHT)
         scale = 1.0 / np.sqrt(variance)[:, None, None]
         S, M = scale * root, scale * (whitening @ moments)
         W = _whitening(S, inner, flatness, L)
         S, M = (W @ S).reshape(P, 3 * L, 3), (W @ M).reshape(P, L, 3, 4)
         patch, combination = _free_of_planes(S)
         rows = np.einsum("rlk,rlka->rla", combination.reshape(-1, L, 3), M[patch])
-        measured = float(np.sqrt(squares[dof > 0].sum() / max(dof.sum(), 1.0)))
-        return cls(rows[:, :, 0], rows[:, :, 1:], normal[patch], centre[patch], points.keyframe[patch], measured)
+        n, c, keyframe = normal[patch], centre[patch], points.keyframe[patch]
+        return cls(rows[:, :, 0], rows[:, :, 1:], n, c, keyframe, float(np.sqrt(usual)))
 
     def at(self, names: tuple[str, ...], state: State) -> tuple[np.ndarray, np.ndarray]:
         """Residuals (n,), and their Jacobians (n, L, 6) by rotation (on the right) and translation of each LiDAR."""

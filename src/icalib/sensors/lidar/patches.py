@@ -15,7 +15,7 @@ from scipy.spatial import KDTree
 RADII_M = (2.0, 1.0, 0.5)  # of the patches: wider ones bend on roads, on narrower ones tilts are inaccurate
 FEWEST_POINTS = 8  # of each of two LiDARs: a plane has three unknowns
 GRAZING = 0.15  # least cosine between beam and normal, 81 deg: beams below meet the plane anywhere
-FLAT_SHARE = 0.8  # of the points in the sphere must lie on the plane; fewer do at corners
+FLAT_SHARE = 0.95  # of the points in the sphere must lie on the plane; at corners the rest tilts it
 ROUGH_RATIO = 1.5  # largest scatter about the plane of a LiDAR's points, over the noise
 SPREAD_SHARE = 0.2  # of the radius: least standard deviation of all points along the patch
 LARGEST_TILT = 0.1  # slope between the planes of two LiDARs, which the pose explains in part
