@@ -79,6 +79,13 @@ def test_the_draft_has_a_fisheye_and_a_lidar(recorded):
     assert rig.cameras[0].model == "pinhole-equidistant"
 
 
+def test_ranges_are_too_near(result):
+    """Its owners correct them by 30 mm."""
+    offset = result.group("lidar0", "range_offset")
+    assert -0.045 < offset.value[0] < -0.02
+    assert offset.std[0] < 0.006
+
+
 def test_the_pose_is_the_published_one(result, reference):
     pose = lidar_pose(result)
     turn, shift = apart(pose.T, np.array(reference["T_cam_lidar_published"]))

@@ -257,8 +257,14 @@ def _calibrate(options: argparse.Namespace) -> int:
 def _simulate(options: argparse.Namespace) -> None:
     from icalib.cli.console import console_progress
     from icalib.tools.simulation import load_scenario, simulate, write_sensors, write_tables
+    from icalib.tools.simulation.stops import load_stops, write_stops
     from icalib.tools.simulation.writing import check_absent
 
+    if (stops := load_stops(options.scenario)) is not None:
+        if options.level != "data":
+            raise CalibrationError("rigs at rest are simulated as tables; leave --level out.")
+        write_stops(stops, stops.seed if options.seed is None else options.seed, options.output)
+        return
     scenario = load_scenario(options.scenario)
     seed = scenario.seed if options.seed is None else options.seed
     check_absent(options.output)

@@ -108,7 +108,7 @@ def _sensors(value: YamlValue, start_ns: int) -> dict[str, Any]:
         if kind == "imu" and name == "imu0":
             imus.append(_imu(sensor))
         elif kind == "camera":
-            cameras.append(_camera(name, sensor, start_ns))
+            cameras.append(read_camera(name, sensor, start_ns))
         else:
             others.append(kinds[kind].parse(name, sensor, start_ns))
     if not imus:
@@ -125,7 +125,8 @@ def _imu(value: YamlValue) -> dict[str, Any]:
     return {"imu_rate_hz": fields["rate"].positive(), "imu_noise": noise, "imu_sampling": sampling} | biases
 
 
-def _camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
+def read_camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
+    """A camera from its section `value`; start_ns: origin of all clocks."""
     required = ("model", "resolution", "intrinsics", "distortion", "noise_px")
     fields, common = mounted_fields(value, start_ns, required, ("dropouts",))
     model = fields["model"].choice("camera model", MODELS)

@@ -7,15 +7,24 @@ obvious ones, by rays and planes in the frame of the camera; none is the estimat
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
+from icalib.base.files import below, write_text
+from icalib.base.yaml_nodes import YamlValue, read_yaml
 from icalib.data.measurements import CornerStream, LidarStream, Measurements
 from icalib.geometry.targets import Checkerboard, Target
+from icalib.kinds import simulated_kinds
 from icalib.rig import Camera, Lidar, Parameter, Rig, Settings, by_name
+from icalib.rig.file import rig_to_dict, target_of
 from icalib.tools.simulation.motion import rotation_from_vector
 from icalib.tools.simulation.projection import project, visible
-from icalib.tools.simulation.scenario import SimCamera
+from icalib.tools.simulation.scenario import SimCamera, interval
+from icalib.tools.simulation.scenario_file import read_camera
+from icalib.tools.simulation.writing import atomic_output, write_corners
 
 _STOP_NS = 1_000_000_000  # between stops
 # From LiDAR axes (x ahead, y left) to those of a camera that looks ahead (x right, y down), a little askew.
@@ -43,6 +52,7 @@ class Stops:
     carried: T_board_panel (n, 4, 4) of such objects that move with the board."""
 
     n_stops: int = 10
+    seed: int = 0
     camera: SimCamera = field(default_factory=_camera)
     T_cam_lidar: np.ndarray = field(default_factory=_t_cam_lidar)
     target: Target = field(default_factory=lambda: Checkerboard(7, 6, 0.095, sheet=(0.7, 0.85)))
@@ -63,9 +73,9 @@ class Stops:
         """The rig that a user would write, without any true value but, if `knows_lens`, those of the lens."""
         c, sheet = self.camera, replace(self.target, size_sigma=0.0)
         lens = [Parameter("fixed", np.array(x)) if knows_lens else Parameter() for x in (c.intrinsics, c.distortion)]
-        camera = Camera(c.name, "", c.model, c.resolution, c.corner_noise_px, lens[0], lens[1])
+        camera = Camera(c.name, f"{c.name}/corners.csv", c.model, c.resolution, c.corner_noise_px, lens[0], lens[1])
         settings = Settings(loss="none", outlier_std=0.0, bloom=False, board_shape=False, blur_noise=False, segments=0)
-        return Rig(by_name(camera, Lidar("lidar0", "", self.range_noise_m)), sheet, settings=settings)
+        return Rig(by_name(camera, Lidar("lidar0", "lidar0/scans.npz", self.range_noise_m)), sheet, settings=settings)
 
 
 def simulate_stops(stops: Stops, seed: int) -> tuple[Measurements, np.ndarray]:
@@ -137,3 +147,73 @@ def _to_sheet(T: np.ndarray, outline: np.ndarray, origin: np.ndarray, rays: np.n
     xy = ((origin + distance[:, None] * rays - T[:3, 3]) @ T[:3, :3])[:, :2]
     hit = (distance > 0.0) & (xy > outline[0]).all(axis=1) & (xy < outline[1]).all(axis=1)
     return np.where(hit, distance, np.inf)
+
+
+# Scenario files of rigs at rest; their format is described in docs/simulation.md.
+
+
+def load_stops(path: Path) -> Stops | None:
+    """The scenario of a file with a section `stops`; None for other files. Raises RigError, one sentence naming file,
+    line, field, what is wrong and what to do."""
+    root = read_yaml(path, "scenario file")
+    if "stops" not in root.entries():
+        return None
+    fields = root.record(("stops", "sensors", "target"), ("seed",))
+    sensors = fields["sensors"].record(("cam0", "lidar0"))
+    camera = read_camera("cam0", sensors["cam0"], 0)
+    lidar: Any = simulated_kinds()["lidar"].parse("lidar0", sensors["lidar0"], 0)
+    target = target_of(fields["target"])
+    if len(target.outlines) != 1:
+        fields["target"].fail("a rig at rest is simulated before one board; give one.")
+    return Stops(
+        camera=camera,
+        T_cam_lidar=np.linalg.inv(camera.T_imu_sensor) @ lidar.T_imu_sensor,
+        target=target,
+        rings=lidar.rings,
+        azimuth_steps=lidar.azimuth_steps,
+        elevation_deg=lidar.elevation_deg,
+        range_noise_m=lidar.range_noise_m,
+        seed=fields["seed"].whole(0) if "seed" in fields else 0,
+        **_places(fields["stops"]),
+    )
+
+
+def _places(value: YamlValue) -> dict[str, Any]:
+    """The fields of `Stops` that the section `stops` sets."""
+    fields = value.record(("count",), ("distance", "board_angles_deg", "range_offset", "room"))
+    chosen: dict[str, Any] = {"n_stops": fields["count"].whole(1)}
+    if "distance" in fields:
+        chosen["distance_m"] = interval(fields["distance"])
+    if "board_angles_deg" in fields:
+        chosen["board_angles_deg"] = tuple(fields["board_angles_deg"].vector(3).tolist())
+    if "range_offset" in fields:
+        chosen["range_offset_m"] = fields["range_offset"].number()
+    if "room" in fields:
+        chosen["room_m"] = fields["room"].positive()
+    return chosen
+
+
+def write_stops(stops: Stops, seed: int, path: Path) -> None:
+    """Writes corners, clouds, their truth and their rig file to the new folder `path`, atomically. Raises
+    RecordingError if `path` exists or cannot be written."""
+    measured, boards = simulate_stops(stops, seed)
+    camera, lidar = stops.camera, measured.lidars[0]
+    rig = replace(stops.rig(knows_lens=False), settings=Settings())
+    lens = {"intrinsics": list(map(float, camera.intrinsics)), "distortion": list(map(float, camera.distortion))}
+    truth = {
+        "seed": seed,
+        "sensors": {
+            "cam0": {"type": "camera", "model": camera.model} | lens,
+            "lidar0": {
+                "type": "lidar", "T_cam0_lidar0": stops.T_cam_lidar.tolist(), "range_offset": stops.range_offset_m
+            },
+        },
+        "T_cam0_board": boards.tolist(),
+    }  # fmt: skip
+    with atomic_output(path) as folder:
+        write_corners(below(folder, camera.name), measured.cameras[0], stops.target)
+        scans = {name: getattr(lidar, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
+        below(folder, lidar.name).mkdir(parents=True)
+        np.savez(below(folder, lidar.name) / "scans.npz", **scans)
+        for name, plain in (("rig.yaml", rig_to_dict(rig)), ("truth.yaml", truth)):
+            write_text(folder / name, yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=1000))

@@ -15,6 +15,7 @@ import yaml
 from icalib.base.files import below, staged, write_new, write_text
 from icalib.data.measurements import CornerStream, ImuStream, TrackStream
 from icalib.errors import RecordingError, RigError
+from icalib.geometry.targets import Target
 from icalib.tools.simulation.filming import Film, Shot
 from icalib.tools.simulation.output import IMAGE, IMU, IMU_TOPIC, BagForm, BagWriter, package, write_table
 from icalib.tools.simulation.recording import Simulation, Truth
@@ -164,7 +165,8 @@ def write_tables(
     assert measured.imu is not None  # of every scenario
     with atomic_output(path) as folder:
         steps: list[Callable[[], None]] = [partial(_write_imu, below(folder, measured.imu.name), measured.imu)]
-        steps += [partial(_write_corners, below(folder, c.name), c, simulation.scenario) for c in measured.cameras]
+        target = simulation.scenario.target
+        steps += [partial(write_corners, below(folder, c.name), c, target) for c in measured.cameras]
         steps += [partial(_write_tracks, below(folder, t.name), t) for t in measured.tracks]
         for sensor in simulation.scenario.sensors:
             steps.append(partial(_record(simulation, sensor).write_table, below(folder, sensor.name)))
@@ -221,8 +223,9 @@ def _write_imu(folder: Path, imu: ImuStream) -> None:
     write_table(folder / "data.csv", header, imu.stamps_ns, imu.gyro, imu.accel)
 
 
-def _write_corners(folder: Path, corners: CornerStream, scenario: Scenario) -> None:
-    names = scenario.target.point_identity(corners.point)
+def write_corners(folder: Path, corners: CornerStream, target: Target) -> None:
+    """Writes the table of a camera's corners to the new folder `folder`."""
+    names = target.point_identity(corners.point)
     stamps = corners.stamps_ns[corners.image]
     write_table(folder / "corners.csv", "t [ns],tag id,corner,u [px],v [px]", stamps, *names, corners.uv)
 
