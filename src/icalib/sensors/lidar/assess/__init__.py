@@ -25,8 +25,8 @@ from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, times
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes
-from icalib.sensors.lidar.assess.patches import on_patches
 from icalib.sensors.lidar.binning import LidarNoise, in_world
+from icalib.sensors.lidar.patch_factor import PatchFactor
 from icalib.sensors.lidar.residual import LidarFactor, less_offset
 from icalib.sensors.lidar.stream import LidarResiduals
 
@@ -44,7 +44,7 @@ HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of res
 def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     if a.inputs.association.at_rest:
-        return on_boards(a) if a.inputs.rig.has_target else on_patches(a)
+        return on_boards(a) if a.inputs.rig.has_target else Assessment(notes=_notes_on_patches(a))
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
@@ -257,3 +257,17 @@ def length(lidar: Lidar, rig: Rig) -> str | None:
 
 
 ASSESSOR = Assessor(assess, misfit, length=length)
+
+
+def _notes_on_patches(a: AssessedEstimate) -> Iterator[Remark]:
+    """A note on the patches that each LiDAR sees, and how flat they are."""
+    for f in of_type(a.estimate.problem.factors, PatchFactor):
+        seen = np.unique(np.stack([f.points.patch, f.points.lidar]), axis=1)[1]
+        counts = ", ".join(f"{n} by {name}" for name, n in zip(f.names, np.bincount(seen).tolist(), strict=True))
+        stops = len(np.unique(f.points.keyframe))
+        yield Remark(
+            "lidar_surfaces_shared",
+            f"LiDARs share {len(f.points.keyframe)} surfaces at {stops} {'stop' if stops == 1 else 'stops'}, seen "
+            f"{counts}; points scatter {1e3 * f.patches.point_sigma:.1f} mm about them, and they deviate "
+            f"{1e3 * f.noise.flatness:.1f} mm from planes.",
+        )
