@@ -238,7 +238,7 @@ class Planes(NamedTuple):
     range_offset: float
 
     @classmethod
-    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray, range_offset: float) -> Planes:
+    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray, range_offset: float = 0.0) -> Planes:
         """Planes, or tilts of the target, with the keys `keys` and their values in `state`. A tilt turns its plane
         about x and y of the world."""
         value = np.array([plane_value(state.values[key]) for key in keys])
