@@ -249,8 +249,8 @@ _SIDES = {"0": "left", "1": "right"}  # last character of a sensor name -> word 
 
 
 def has_pictures(root: Path) -> bool:
-    """True if `root` or a direct subfolder contains images or point clouds."""
-    return bool(_topics(root) or _topics(root, CLOUD_SUFFIXES))
+    """True if `root` or a direct subfolder contains images, or point clouds and no tables beside them."""
+    return bool(_topics(root) or (_topics(root, CLOUD_SUFFIXES) and not _top_tables(root)))
 
 
 @final
