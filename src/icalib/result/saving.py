@@ -256,8 +256,8 @@ def _check(c: Calibration) -> None:
         sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
         if sizes != {size} or (g.columns is not None and not all(0 <= k < n for k in g.columns)):
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
-    if not any(s.get("type") in ("imu", "camera", "pose") for s in c.rig["sensors"].values()):
-        raise ValueError("the rig has neither IMU nor camera nor pose sensor")
+    if not any(s.get("type") in ("imu", "camera", "lidar", "pose") for s in c.rig["sensors"].values()):
+        raise ValueError("the rig has no IMU, camera, LiDAR or pose sensor")
     if (
         c.cross_validation is not None
         and not c.cross_validation.shift.shape

@@ -16,6 +16,7 @@ from icalib.errors import EstimationError, RecordingError
 from icalib.geometry import so3
 from icalib.optim.state import State
 from icalib.pipeline import calibrate, calibrate_measurements
+from icalib.result import load_calibration
 from icalib.rig.file import rig_from_dict
 from icalib.sensors.lidar.initialize.registration import Surfels, register
 from icalib.sensors.lidar.patch_factor import PatchPoints, PatchRows
@@ -90,7 +91,7 @@ def _state(poses):
 
 
 @each("scene", ["room"], full=["street"])
-def test_lidars_are_calibrated_by_what_they_share(scene):
+def test_lidars_are_calibrated_by_what_they_share(scene, tmp_path):
     setup = {"room": SMALL, "street": ON_STREET}[scene]
     result = calibrate_measurements(setup.rig(), simulate_surroundings(setup, 2))
     error, covariance = errors(result, setup.T_lidar0["lidar1"])
@@ -99,6 +100,9 @@ def test_lidars_are_calibrated_by_what_they_share(scene):
     assert error @ np.linalg.solve(covariance, error) < 22.5  # chi^2 of 6 at 99.9 %
     assert "lidar_surfaces_shared" in names(result.notes)
     assert not {"smooth_motion_assumed"} & set(names(result.notes))
+    result.save(tmp_path)
+    loaded = load_calibration(tmp_path)
+    np.testing.assert_array_equal(loaded.T_body_sensor("lidar1"), result.T_body_sensor("lidar1"))
 
 
 REFUSED = {
