@@ -319,8 +319,7 @@ def _seeds(cloud: StopCloud, free: np.ndarray, radius_m: float) -> np.ndarray:
     n, lidars = int(cell.max(initial=-1)) + 1, int(cloud.lidar.max()) + 1
     count = np.bincount(cell.ravel() * lidars + cloud.lidar[free], minlength=n * lidars).reshape(n, lidars)
     second = np.sort(count, axis=1)[:, -2]
-    centre = np.stack([np.bincount(cell.ravel(), points[:, k], n) for k in range(3)], axis=1)
-    centre /= count.sum(axis=1, keepdims=True)
+    centre = _sums(cell.ravel(), n, points) / count.sum(axis=1, keepdims=True)
     order = np.argsort(-second, kind="stable")
     return centre[order[second[order] >= FEWEST_POINTS // 2]]
 

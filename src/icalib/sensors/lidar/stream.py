@@ -43,6 +43,11 @@ class LidarStream(Stream):
         columns = {name: getattr(self, name)[points] for name in ("offset_s", "xyz", "plane")}
         return replace(self, start=np.searchsorted(points, self.start), **columns)
 
+    def of_scans(self, kept: np.ndarray, stamps_ns: np.ndarray) -> LidarStream:
+        """The scans selected by the mask `kept`, with other stamps (n,)."""
+        some = self.some(np.repeat(kept, np.diff(self.start)))
+        return replace(some, stamps_ns=stamps_ns, start=np.append(some.start[:-1][kept], some.start[-1]))
+
     def unassociated(self) -> LidarStream:
         """The stream without known planes."""
         return replace(self, plane=np.full(len(self.plane), -1, np.int32))

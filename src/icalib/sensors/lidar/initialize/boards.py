@@ -30,6 +30,7 @@ from icalib.motion.point_planes import AT_REST
 from icalib.optim.state import State, in_recording
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.board_factor import RIM_M
+from icalib.sensors.lidar.initialize.registration import cell_centroids
 from icalib.sensors.parameter import fixed
 
 # Flat clusters of about the size of a sheet.
@@ -53,9 +54,7 @@ class FlatClusters:
 def sheet_like(xyz: np.ndarray, size: np.ndarray) -> FlatClusters:
     """The clusters of a cloud xyz (N, 3) that are flat and about as large as a sheet of `size` (2,) m."""
     reach = NEIGHBOUR_SHARE * float(size.min())
-    cells, cell = np.unique(np.floor(xyz / (CELL_SHARE * reach)).astype(np.int64), axis=0, return_inverse=True)
-    count = np.bincount(cell.ravel(), minlength=len(cells))
-    centre = np.stack([np.bincount(cell.ravel(), xyz[:, k], len(cells)) for k in range(3)], axis=1) / count[:, None]
+    centre = cell_centroids(xyz, CELL_SHARE * reach)
     pairs = KDTree(centre).query_pairs(reach, output_type="ndarray")
     normal = _normals(centre, pairs)
     a, b = pairs.T
@@ -202,7 +201,7 @@ def _fit(sheets: Sheets, clouds: Sequence[np.ndarray], pose: Extrinsics) -> Extr
 
 # The whole guess of a rig at rest.
 
-SAME_STOP_SHARE = 0.2  # of the time between stops: image and cloud nearer in time belong to the same stop
+SAME_STOP_SHARE = 0.2  # of the time between stops: images and clouds nearer in time belong to the same stop
 
 
 def is_at_rest(rig: Rig, body: Sequence[BodyPoses]) -> bool:
@@ -247,10 +246,8 @@ def _at_stops(m: Measurements, body: BodyPoses) -> Measurements:
         near = np.sort(near[np.unique(k[near], return_index=True)[1]])  # the nearest of each stop
         kept = np.zeros(len(stream.stamps_ns), bool)
         kept[near] = True
-        some = stream.some(np.repeat(kept, np.diff(stream.start)))
-        start = np.append(some.start[:-1][kept], some.start[-1])
         stamps_ns = m.origin_ns + np.round(body.seconds[k[near]] * 1e9).astype(np.int64)
-        m = m.with_streams(replace(some, stamps_ns=stamps_ns, start=start))
+        m = m.with_streams(stream.of_scans(kept, stamps_ns))
     return m
 
 

@@ -60,6 +60,12 @@ def _fibonacci(n: int) -> np.ndarray:
     return np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
 
 
+def cell_centroids(xyz: np.ndarray, edge_m: float) -> np.ndarray:
+    """(n, 3) centroids of the points xyz (N, 3) m in each cubic cell that has some."""
+    _, cell, count = np.unique(np.floor(xyz / edge_m), axis=0, return_inverse=True, return_counts=True)
+    return np.stack([np.bincount(cell.ravel(), column) for column in xyz.T], axis=1) / count[:, None]
+
+
 @dataclass(frozen=True)
 class Surfels:
     """Surfels of one cloud. point (n, 3) m: centroids of cells; flat (f,): indices of those on a surface; normal
@@ -73,8 +79,7 @@ class Surfels:
     def of(cls, xyz: np.ndarray) -> Surfels:
         """Surfels of a cloud xyz (N, 3) m."""
         xyz = xyz[np.linalg.norm(xyz, axis=1) < FARTHEST_M].astype(np.float64)
-        _, cell, count = np.unique(np.floor(xyz / CELL_M), axis=0, return_inverse=True, return_counts=True)
-        point = np.stack([np.bincount(cell.ravel(), xyz[:, k]) for k in range(3)], axis=1) / count[:, None]
+        point = cell_centroids(xyz, CELL_M)
         if len(point) < NEIGHBOURS:
             return cls(np.zeros((0, 3)), np.zeros(0, int), np.zeros((0, 3)))
         near = point[KDTree(point).query(point, k=NEIGHBOURS)[1]]

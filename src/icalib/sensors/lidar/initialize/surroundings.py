@@ -21,11 +21,10 @@ from icalib.motion.factor import Extrinsics
 from icalib.motion.point_planes import AT_REST
 from icalib.optim.state import State
 from icalib.rig import Rig
+from icalib.sensors.lidar.initialize.boards import SAME_STOP_SHARE
 from icalib.sensors.lidar.initialize.registration import LEAST_SCORE, SAME_RAD, Registration, Surfels, register
 from icalib.sensors.parameter import fixed
 from icalib.sensors.sensor import mounted
-
-SAME_STOP_SHARE = 0.2  # of the time between stops: clouds nearer in time belong to the same stop
 
 
 def are_stops(rig: Rig, recordings: Sequence[Measurements]) -> bool:
@@ -81,9 +80,7 @@ def _same_stamps(m: Measurements, body: str) -> Measurements:
                 "give the clouds of a stop the same number."
             )
         kept = np.isin(np.arange(len(stream.stamps_ns)), scan[near])
-        some = stream.some(np.repeat(kept, np.diff(stream.start)))
-        start = np.append(some.start[:-1][kept], some.start[-1])
-        m = m.with_streams(replace(some, stamps_ns=reference.stamps_ns[near], start=start))
+        m = m.with_streams(stream.of_scans(kept, reference.stamps_ns[near]))
     return m
 
 

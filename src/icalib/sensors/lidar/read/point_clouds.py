@@ -371,9 +371,7 @@ def checked_stops(stream: LidarStream, what: str, fewest: int = 1) -> tuple[Lida
     if filled.all():
         return stream, ()
     sentence = f"{what}: {int((~filled).sum())} of {len(filled)} scans have no usable point and were left out."
-    start = np.append(stream.start[:-1][filled], stream.start[-1])
-    stream = LidarStream(stream.name, stream.stamps_ns[filled], start, stream.offset_s, stream.xyz, stream.plane)
-    return stream, (Remark("scans_empty", sentence),)
+    return stream.of_scans(filled, stream.stamps_ns[filled]), (Remark("scans_empty", sentence),)
 
 
 def _near_their_stamps(stream: LidarStream, what: str) -> tuple[LidarStream, tuple[Remark, ...]]:
