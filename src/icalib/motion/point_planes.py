@@ -107,9 +107,10 @@ class PlaneAssociation:
         """(P,) number of points on each plane."""
         return self._counts[:, : self.count].sum(axis=0)
 
-    def points_on_sheets(self, lidar: int) -> int:
-        """Number of points of the LiDAR with this index on the sheets."""
-        return int(self._counts[lidar, self.count :].sum())
+    @property
+    def points_on_sheets(self) -> np.ndarray:
+        """(L, sheets) number of points of each LiDAR on each sheet."""
+        return self._counts[:, self.count :]
 
     @cached_property
     def _counts(self) -> np.ndarray:

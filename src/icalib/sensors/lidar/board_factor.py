@@ -153,17 +153,12 @@ class TargetSheet:
             return None
         return cls(state.values[in_recording(BOARD, recording), "tilt"], bodies.target.outlines[bodies.used[0]])
 
-    def is_seen(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch, fewest: int) -> bool:
-        """Whether at least `fewest` points (N, 3) seen from `origins` (N, 3) are on it. If most beams go through it, it
-        is elsewhere."""
+    def away(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch, fewest: int) -> np.ndarray | None:
+        """(N,) bool: which of points (N, 3) seen from `origins` (N, 3) are neither on the sheet nor beside it. None if
+        it is not seen: fewer than `fewest` points are on it, or most beams go through it, so that it is elsewhere."""
         kinds = self.of_points(points, origins, search)
         hits, through = (np.count_nonzero(kinds == kind) for kind in (ON_SHEET, THROUGH_SHEET))
-        return bool(hits >= max(fewest, through))
-
-    def others(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> tuple[np.ndarray, np.ndarray]:
-        """Those of points (N, 3) that are neither on the sheet nor beside it, and their `origins`."""
-        far = self.of_points(points, origins, search) <= 0
-        return points[far], origins[far]
+        return kinds <= 0 if hits >= max(fewest, through) else None
 
     def of_points(self, points: np.ndarray, origins: np.ndarray, search: PlaneSearch) -> np.ndarray:
         """(N,) int8: ON_SHEET for points (N, 3) whose beams from `origins` (N, 3) hit the sheet, NEAR_SHEET for others

@@ -35,7 +35,7 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         observable = spec is not RANGE_OFFSET or (association.at_rest and rig.has_target)
         if association.sheets:
             k = [x.name for x in rig.lidars].index(sensor.name)
-            observable = observable or association.points_on_sheets(k) > 0
+            observable = observable or association.points_on_sheets[k].any()
         return observable and super().is_estimated(sensor, spec, rig, association)
 
     def keyframe_times(

@@ -240,6 +240,20 @@ def _degeneracy_warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]
         )
 
 
+def _notes_on_patches(a: AssessedEstimate) -> Iterator[Remark]:
+    """A note on the patches that each LiDAR sees, and how flat they are."""
+    for f in of_type(a.estimate.problem.factors, PatchFactor):
+        seen = np.unique(np.stack([f.points.patch, f.points.lidar]), axis=1)[1]
+        counts = ", ".join(f"{n} by {name}" for name, n in zip(f.names, np.bincount(seen).tolist(), strict=True))
+        stops = len(np.unique(f.points.keyframe))
+        yield Remark(
+            "lidar_surfaces_shared",
+            f"LiDARs share {len(f.points.keyframe)} surfaces at {stops} {'stop' if stops == 1 else 'stops'}, seen "
+            f"{counts}; points scatter {1e3 * f.patches.point_sigma:.1f} mm about them, and they deviate "
+            f"{1e3 * f.noise.flatness:.1f} mm from planes.",
+        )
+
+
 def misfit(lidar: Lidar, f: SensorFit, is_noise: bool) -> Remark | None:
     """A sentence if points are farther from planes than the stated range noise predicts, else None."""
     if excess(f) == 1.0 or lidar.range_noise_m is None:
@@ -257,17 +271,3 @@ def length(lidar: Lidar, rig: Rig) -> str | None:
 
 
 ASSESSOR = Assessor(assess, misfit, length=length)
-
-
-def _notes_on_patches(a: AssessedEstimate) -> Iterator[Remark]:
-    """A note on the patches that each LiDAR sees, and how flat they are."""
-    for f in of_type(a.estimate.problem.factors, PatchFactor):
-        seen = np.unique(np.stack([f.points.patch, f.points.lidar]), axis=1)[1]
-        counts = ", ".join(f"{n} by {name}" for name, n in zip(f.names, np.bincount(seen).tolist(), strict=True))
-        stops = len(np.unique(f.points.keyframe))
-        yield Remark(
-            "lidar_surfaces_shared",
-            f"LiDARs share {len(f.points.keyframe)} surfaces at {stops} {'stop' if stops == 1 else 'stops'}, seen "
-            f"{counts}; points scatter {1e3 * f.patches.point_sigma:.1f} mm about them, and they deviate "
-            f"{1e3 * f.noise.flatness:.1f} mm from planes.",
-        )

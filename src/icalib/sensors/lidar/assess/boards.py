@@ -131,8 +131,8 @@ def sheet_planes(inputs: Inputs, state: State) -> Iterator[Plane]:
     for k, r in enumerate(association.sheets):
         tilt = state.values[association.surfaces[association.count + k]]
         middle = np.append(bodies.target.outlines[bodies.used[0]].mean(axis=0), 0.0)
-        points = int(sum((p == association.count + k).sum() for p in association.plane))
-        yield Plane(in_recording("sheet", r), tilt[:, 2].copy(), tilt @ middle, points)
+        points = association.points_on_sheets[:, k].sum()
+        yield Plane(in_recording("sheet", r), tilt[:, 2].copy(), tilt @ middle, int(points))
 
 
 def sheet_notes(a: AssessedEstimate) -> Iterator[Remark]:
@@ -141,7 +141,7 @@ def sheet_notes(a: AssessedEstimate) -> Iterator[Remark]:
     if not association.count or not bodies.used or not bodies.target.has_sheet[bodies.used[0]]:
         return
     for k, lidar in enumerate(a.inputs.rig.lidars):
-        if points := association.points_on_sheets(k):
+        if points := association.points_on_sheets[k].sum():
             yield Remark(
                 "lidar_points_on_sheet",
                 f"{points} points of {lidar.name} lie on the target; its place is that in the images.",

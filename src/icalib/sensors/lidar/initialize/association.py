@@ -369,8 +369,9 @@ def associate(
     streams = [less_offset(s, motion.state) for s in streams]
     step = odd_step(sum(len(s.xyz) for s in streams))
     thinned = [in_world(motion, _every(step, s)) for s in streams]
-    sheets = [sheet if sheet and sheet.is_seen(*cloud, search, MIN_PLANE_POINTS) else None for cloud in thinned]
-    others = [c if s is None else s.others(*c, search) for s, c in zip(sheets, thinned, strict=True)]
+    away = [sheet and sheet.away(*cloud, search, MIN_PLANE_POINTS) for cloud in thinned]
+    sheets = [None if far is None else sheet for far in away]
+    others = [(x, o) if far is None else (x[far], o[far]) for far, (x, o) in zip(away, thinned, strict=True)]
     points, origins = zip(*others, strict=True)
     planes = find_planes(np.concatenate(points), np.concatenate(origins), search)
     if not planes.count:
