@@ -23,11 +23,13 @@ class Clock:
 
     @classmethod
     def of(cls, c: Calibration, span: RecordingSpan, sensor: str) -> Clock:
-        values = [g.value for g in c.groups if (g.sensor, g.name) == (sensor, "time_offset")]
-        if not values:
-            return cls(span, 0.0)
-        (value,) = values
-        return cls(span, float(value[c.recordings.index(span) if len(value) > 1 else 0]))
+        group = c.group_or_none(sensor, "time_offset")
+        return cls(span, 0.0) if group is None else cls.with_offset(c, span, group.value)
+
+    @classmethod
+    def with_offset(cls, c: Calibration, span: RecordingSpan, offset_s: np.ndarray) -> Clock:
+        """That of a sensor with one time offset, or one for each recording."""
+        return cls(span, float(offset_s[c.recordings.index(span) if len(offset_s) > 1 else 0]))
 
     def seconds(self, stamps_ns: np.ndarray) -> np.ndarray:
         """(n,) seconds of the result from int64 stamps [ns]. Whole nanoseconds are subtracted first, so that no digit

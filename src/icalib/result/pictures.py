@@ -51,12 +51,10 @@ class Mount:
         T = np.eye(4) if sensor == c.reference else c.T_imu_sensor(sensor)
         clock, guess = Clock.of(c, span, sensor), c.first_guess
         if first:
-            T[:3, :3], T[:3, 3] = (
-                guess.get((sensor, "rotation"), T[:3, :3]),
-                guess.get((sensor, "translation"), T[:3, 3]),
-            )
-            offset = guess.get((sensor, "time_offset"), np.array([clock.offset_s]))
-            clock = Clock(span, float(offset[c.recordings.index(span) if len(offset) > 1 else 0]))
+            T[:3, :3] = guess.get((sensor, "rotation"), T[:3, :3])
+            T[:3, 3] = guess.get((sensor, "translation"), T[:3, 3])
+            offset = guess.get((sensor, "time_offset"))
+            clock = clock if offset is None else Clock.with_offset(c, span, offset)
         return cls(T, clock)
 
 

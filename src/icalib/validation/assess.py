@@ -117,9 +117,10 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
 
 def _first_guess(inputs: Inputs) -> dict[tuple[str, str], np.ndarray]:
     """Extrinsics and time offsets in the first guess, if it is kept, as in the result."""
-    guess = inputs.guess
-    blocks = [b for b in inputs.layout.blocks if guess and b.name in MOUNTED_NAMES and b.key in guess.values]
-    return {b.key: _raw_value(inputs, guess, b) for b in blocks} if guess else {}
+    if (guess := inputs.guess) is None:
+        return {}
+    blocks = [b for b in inputs.layout.blocks if b.name in MOUNTED_NAMES and b.key in guess.values]
+    return {b.key: _raw_value(inputs, guess, b) for b in blocks}
 
 
 def _observed(inputs: Inputs, determined: Determined, names: tuple[str, ...]) -> Observability:
