@@ -13,6 +13,7 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.rig import Lidar, Rig, by_name
 from icalib.tools.simulation.motion import rotation_from_vector
+from icalib.tools.simulation.stops import directions
 
 _STOP_NS = 1_000_000_000  # between stops
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]  # centre, size [m], yaw [deg]
@@ -87,9 +88,7 @@ def simulate_surroundings(scene: Surroundings, seed: int) -> Measurements:
 def _cloud(scene: Surroundings, T_world_lidar: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """(N, 3) measured points in the frame of the LiDAR, of the beams that hit something within 100 m."""
     azimuth = 2.0 * np.pi * np.arange(scene.azimuth_steps)[:, None] / scene.azimuth_steps
-    elevation = np.deg2rad(np.linspace(*scene.elevation_deg, scene.rings))
-    axes = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation) + 0.0 * azimuth
-    beams = np.stack(axes, axis=2).reshape(-1, 3)
+    beams = directions(azimuth, np.deg2rad(np.linspace(*scene.elevation_deg, scene.rings)))
     rays, origin = beams @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
     distance = np.min([_to_box(box, origin, rays) for box in scene.boxes], axis=0)
     hit = distance < 100.0

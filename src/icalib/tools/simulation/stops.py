@@ -126,9 +126,7 @@ def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> n
     """(N, 3) measured points in the frame of the LiDAR: each beam ends at the board, a panel or a wall."""
     azimuth = np.pi * (2.0 * np.arange(stops.azimuth_steps)[:, None] / stops.azimuth_steps - 1.0)
     azimuth = azimuth[_between(azimuth[:, 0], stops.azimuth_deg)]
-    elevation = np.deg2rad(np.linspace(*stops.elevation_deg, stops.rings))
-    axes = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation) + 0.0 * azimuth
-    beams = np.stack(axes, axis=2).reshape(-1, 3)
+    beams = directions(azimuth, np.deg2rad(np.linspace(*stops.elevation_deg, stops.rings)))
     R, origin = stops.T_cam_lidar[:3, :3], stops.T_cam_lidar[:3, 3]
     rays = beams @ R.T
     ahead = np.where(rays > 0.0, 1.0, -1.0) * stops.room_m - origin
@@ -138,6 +136,12 @@ def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> n
         distance = np.minimum(distance, _to_sheet(T, outline, origin, rays))
     measured = distance + stops.range_offset_m + stops.range_noise_m * rng.standard_normal(len(distance))
     return beams * measured[:, None]
+
+
+def directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
+    """(n rings, 3) unit vectors of a spinning LiDAR's beams at each azimuth (n, 1) and elevation (rings,) [rad]."""
+    axes = np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation) + 0.0 * azimuth
+    return np.stack(axes, axis=2).reshape(-1, 3)
 
 
 def _to_sheet(T: np.ndarray, outline: np.ndarray, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
