@@ -23,7 +23,7 @@ from icalib.geometry.targets.base import BOARD
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import EstimatedMotion, assign_keyframes, place_keyframes
+from icalib.motion.poses import MIDDLE, EstimatedMotion, assign_keyframes, place_keyframes
 from icalib.optim.arrowhead import Piece, make_pieces
 from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
@@ -46,6 +46,7 @@ TOLERANCE = {
     "rotation": 2e-3,
     "translation": 5e-3,
     "time_offset": 1e-3,
+    "clock_rate": 1e3,
     "intrinsics": 1.0,
     "size_effect": 1e-3,
     "distortion": 1e-2,
@@ -186,7 +187,9 @@ def make_setup(
             columns = 3 if name == "rotation" else len(value)
             entries.append((c.name, name, kind, columns, bloom or name != "bloom"))
             values[c.name, name] = value
+        values |= {(c.name, "clock_rate"): np.zeros(1), (c.name, MIDDLE): c.seconds[-1:] / 3.0}
         times.append(c.seconds + offset)
+    entries += [(c.name, "clock_rate", "vector", 1, True) for c in measurements.cameras]
     seconds = place_keyframes(imu, times, spacing, 0.5)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
     streams = restrict(bodies, measurements).cameras
@@ -338,6 +341,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     ]
     entries.append((stream.name, "translation", "vector", 3, True))
     entries.append((stream.name, "time_offset", "vector", 1, True))
+    entries.append((stream.name, "clock_rate", "vector", 1, True))
     entries.append((stream.name, "range_offset", "vector", 1, sheet))
     if sheet:
         assert used[0] == 0, "the first face of a room is its floor"
@@ -347,7 +351,8 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     T, origin_s = truth.T_imu_sensor[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
     values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
-    values[stream.name, "range_offset"] = np.zeros(1)
+    values[stream.name, "range_offset"], values[stream.name, "clock_rate"] = np.zeros(1), np.zeros(1)
+    values[stream.name, MIDDLE] = stream.seconds[-1:] / 3.0
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
     faces = not_none(sim.scenario.room).faces
     for key, k in zip(planes, used, strict=True):

@@ -75,8 +75,8 @@ def test_sentences_of_the_golden_record_are_pinned():
 
 
 DRIFT = (
-    "the clock of wheel0 drifts against the others by about +944 ppm, 65 ms over the recording. Stamp all sensors by "
-    "one clock (hardware trigger, PTP) and record again."
+    "the clock of wheel0 runs about 944 ppm slow against the others, 65 ms over the recording. Write clock_rate: "
+    "{prior: 0, sigma: 1000}, and leave time_offset free; or stamp all sensors by one clock, and record again."
 )
 
 
@@ -86,7 +86,7 @@ DRIFT = (
         ("clock_drifts", DRIFT, True),
         ("clock_drifts", DRIFT + " This explains 89% of what varies over the recording.", True),
         ("clock_drifts", f"monday: {DRIFT}", True),
-        ("clock_drifts", DRIFT.replace("wheel0 drifts", "wheel0 (or that of cam0 the opposite way) drifts"), True),
+        ("clock_drifts", DRIFT.replace("wheel0 runs", "wheel0 (or that of cam0 the opposite way) runs"), True),
         ("clock_drifts", DRIFT.replace("clock of", "time of"), False),
         ("clock_drifts", DRIFT.replace("record again", "try again"), False),
         ("clock_drifts", DRIFT + " Then look.", False),

@@ -135,12 +135,15 @@ def known(count: int | None = None) -> Check:
     return check
 
 
+SI = {"clock_rate": 1e6}  # ppm
+
+
 def exact(bound: float, lens: float = 0.0, least: float = 1e-9) -> Check:
     """All errors are below `bound` [rad, m, s]; those of lenses below `lens` times the true value, or `least`."""
 
     def check(run: Run) -> None:
         for c in compared(run):
-            most = np.maximum(lens * np.abs(c.true), least) if c.name in LENS else bound
+            most = np.maximum(lens * np.abs(c.true), least) if c.name in LENS else bound * SI.get(c.name, 1.0)
             assert (np.abs(c.error) < most).all(), c
 
     return check

@@ -32,7 +32,7 @@ from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import output_at
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import EstimatedMotion, offset_at, poses_at
+from icalib.motion.poses import MIDDLE, EstimatedMotion, offset_at, poses_at
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
 from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import State, in_recording, make_layout
@@ -124,10 +124,12 @@ def with_further_imus(setup, number):
     entries, values = [], {}
     for k, name in enumerate(names):
         entries += [(name, "rotation", "rotation", 3, True), (name, "translation", "vector", 3, True)]
-        entries += [(name, "time_offset", "vector", 1, True), (name, "intrinsics", "vector", 24, True)]
+        entries += [(name, "time_offset", "vector", 1, True), (name, "clock_rate", "vector", 1, True)]
+        entries += [(name, "intrinsics", "vector", 24, True)]
         values |= {(name, "rotation"): so3.exp(np.array([0.1, -0.2, 0.15]) * (k + 1.0))}
         values |= {(name, "translation"): np.array([0.1, 0.05, -0.08]), (name, "time_offset"): np.array([2e-3])}
         entries += [(name, "size_effect", "vector", 6, True)]
+        values |= {(name, "clock_rate"): np.array([60.0]), (name, MIDDLE): np.array([0.1])}
         values |= {(name, "intrinsics"): np.full(24, 1e-3), (name, "size_effect"): np.arange(6) * 1e-3}
     old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     own = np.random.default_rng(3).normal(size=(len(setup.state.seconds), 9 * number)) * 0.05
@@ -207,7 +209,8 @@ def with_two_clocks(setup, keyframe=5):
         (b.sensor, b.name, b.kind, 2 if b.name == "time_offset" else b.size, b.start is not None)
         for b in setup.layout.blocks
     ]
-    values = {k: np.repeat(v, 2) if k[1] == "time_offset" else v for k, v in setup.state.values.items()}
+    own = ("time_offset", MIDDLE)
+    values = {k: np.repeat(v, 2) if k[1] in own else v for k, v in setup.state.values.items()}
     if ("board0", "tilt") in values and (in_recording("board0", 1), "tilt") not in values:
         entries.append((in_recording("board0", 1), "tilt", "tilt", 2, True))
         values[in_recording("board0", 1), "tilt"] = values["board0", "tilt"]
@@ -452,7 +455,7 @@ def lidar_rows_turned(factor, at, turn):
     bin."""
     m, name = factor.moments, factor.name
     bin_of = np.repeat(np.arange(len(m.seconds)), np.diff(m.start))
-    times = m.seconds + offset_at(at, name, factor.keyframe)
+    times = m.seconds + offset_at(at, name, factor.keyframe, m.seconds)
     poses = poses_at(factor.scheme, times, factor.keyframe, at, factor.imu, factor.gravity, False)
     R = poses.rotation @ so3.exp_many(turn)
     R_lidar, p_lidar = R @ at.values[name, "rotation"], poses.position + R @ at.values[name, "translation"]
@@ -529,11 +532,12 @@ def with_wheels(setup, kind="pair"):
         "rotation": so3.exp(np.array([0.03, -0.05, 0.4])),
         "translation": np.array([-0.2, 0.1, -0.15]),
         "time_offset": np.array([0.013]),
+        "clock_rate": np.array([-90.0]),
         **DRIVES[kind],
     }
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("wheel0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in wheels.items()]
-    values = setup.state.values | {("wheel0", k): v for k, v in wheels.items()}
+    values = setup.state.values | {("wheel0", k): v for k, v in wheels.items()} | {("wheel0", MIDDLE): np.array([0.2])}
     gyro, accel = (np.ones((len(x), 1)) * x[5] for x in (setup.imu.gyro, setup.imu.accel))
     imu, state = replace(setup.imu, gyro=gyro, accel=accel), replace(setup.state, values=values)
     return replace(setup, layout=make_layout(entries), state=state, imu=imu)
@@ -594,10 +598,10 @@ def with_poses(setup, starts):
     are constant, as in `with_wheels`."""
     rng = np.random.default_rng(6)
     mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}
-    mount["scale"] = np.array([1.03])
+    mount |= {"scale": np.array([1.03]), "clock_rate": np.array([70.0])}
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
-    values = setup.state.values | {("mocap0", k): v for k, v in mount.items()}
+    values = setup.state.values | {("mocap0", k): v for k, v in mount.items()} | {("mocap0", MIDDLE): np.array([0.2])}
     for k in range(1, len(starts)):
         entries += [(in_recording("board0", k), "tilt", "tilt", 2, True)]
         values[in_recording("board0", k), "tilt"] = so3.exp(rng.normal(size=3))

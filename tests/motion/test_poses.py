@@ -96,7 +96,7 @@ def test_the_chain_rule_of_a_sensor_pose_by_central_differences(setup, scheme):
         J[i, :, KEYFRAME_DIM * k : last] = rows.J[i, :, : last - KEYFRAME_DIM * k]
     J[:, :, o + columns] = rows.J_calib
     offset = o + columns[6]
-    assert len(columns) == 31
+    assert len(columns) == 32
     for column in [*range(o), *(o + columns)]:
         d = h * np.eye(o + setup.layout.size)[column]
         found = difference(poses(d), poses(-d), at, h)

@@ -17,6 +17,7 @@ from icalib.model.sensor_model import Pass, by_kind, model_of
 from icalib.motion.factor import Factor, FactorKey, IndependentKeyframes, Residuals, Whitened, keyed
 from icalib.motion.imu_data import ImuData, without_size_effect
 from icalib.motion.poses import (
+    MIDDLE,
     RECORDING_MARGIN_S,
     EstimatedMotion,
     assign_keyframes,
@@ -428,8 +429,18 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
                 values[sensor.name, spec.name] = np.zeros(spec.size) if stated is None else stated.copy()
     for sensor in rig.mounted:
         if (offset := values.get((sensor.name, TIME_OFFSET.name))) is not None:
-            values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(offset, inputs.clocks_of(sensor))
+            offsets = np.broadcast_to(offset, inputs.clocks_of(sensor))
+            values[sensor.name, TIME_OFFSET.name] = offsets
+            if inputs.imu is not None:
+                values.setdefault((sensor.name, MIDDLE), _middles(inputs, len(offsets)) - offsets)
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}
+
+
+def _middles(inputs: Inputs, n: int) -> np.ndarray:
+    """(n,) s: middle of the recording, or of each, on the body's clock since its first stamp."""
+    bodies = [(p.begin, p.measurements.imu) for p in inputs.parts]
+    edges = np.array([(begin, begin + float(np.ptp(imu.seconds))) for begin, imu in bodies if imu is not None])
+    return edges.mean(axis=1) if n > 1 else np.array([0.5 * (edges.min() + edges.max())])
 
 
 # Gauge freedom of the world frame in a rig without a target: the first keyframe is fixed.

@@ -139,7 +139,8 @@ def _align_to_trajectory(
         values = start_values(inputs, state.values | placed)
         state = resample(replace(state, values=values), keyframes_for(inputs, keyframe_times(inputs, values)), inputs)
     placed |= place_sensors(inputs, state, [s for s in unplaced if s not in hosts])
-    state, guess = replace(state, values=state.values | placed), guess | placed
+    started = start_values(inputs, placed)
+    state, guess = replace(state, values=started | state.values | placed), started | guess | placed
     for kind in kinds_of(rig):
         if kind is not source:
             inputs, state, changed = kind.associated(inputs, state)

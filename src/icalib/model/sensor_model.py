@@ -19,7 +19,7 @@ from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import EstimatedMotion, instants
 from icalib.optim.state import Entry, Key, Layout, State, in_recording
 from icalib.rig import ParameterSpec, Rig, Sensor, scene
-from icalib.sensors.sensor import TIME_OFFSET
+from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET
 
 S = TypeVar("S", bound=Sensor)
 N = TypeVar("N")
@@ -158,9 +158,12 @@ def by_kind(sensors: Iterable[Sensor]) -> Iterator[tuple[SensorModel[Any, Any], 
 
 def own_entries(sensor: Sensor, rig: Rig, n_recordings: int, association: PlaneAssociation) -> list[Entry]:
     """Layout entries of a sensor's parameters. A clock that restarts has a time offset in each recording."""
-    model, n_clocks = model_of(sensor), clocks_of(sensor, n_recordings)
-    specs = (spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec for spec in sensor.specs())
-    return [spec.entry(sensor.name, model.is_estimated(sensor, spec, rig, association)) for spec in specs]
+    model, n_clocks, entries = model_of(sensor), clocks_of(sensor, n_recordings), []
+    for spec in sensor.specs():
+        needed = (spec, TIME_OFFSET) if spec == CLOCK_RATE else (spec,)
+        estimated = all(model.is_estimated(sensor, each, rig, association) for each in needed)
+        entries.append((spec.in_recordings(n_clocks) if spec == TIME_OFFSET else spec).entry(sensor.name, estimated))
+    return entries
 
 
 def clocks_of(sensor: Sensor, n_recordings: int) -> int:

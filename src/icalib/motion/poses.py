@@ -421,8 +421,13 @@ def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
 
 # Time offsets of sensor clocks against the clock of the body: one, or one per recording if the clock restarts.
 #
-# The value of the block time_offset is (1,) or (R,): seconds to add to a sensor's time since its first stamp to get
-# the time of the body.
+#     t_body = t + time_offset + clock_rate (t - t_mid)        t: sensor's time since its first stamp
+#
+# The value of time_offset is (1,) or (R,) s, that of clock_rate (1,) ppm. t_mid (1,) or (R,) is the value of the key
+# MIDDLE, which is no parameter. Without it, as in an initial guess, the rate is zero.
+
+MIDDLE = "middle of the clock"
+PPM = 1e-6
 
 RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; recordings are further apart
 
@@ -430,12 +435,10 @@ RECORDING_MARGIN_S = 5.0  # a measurement may precede its stamp by as much; reco
 def instants(stream: Stream, values: Mapping[Key, np.ndarray], seconds: np.ndarray | None = None) -> np.ndarray:
     """Times (n,) on the clock of the body. seconds (n,): times since the first stamp of the stream, by default those of
     its stamps."""
-    t, offset = stream.seconds if seconds is None else seconds, values[stream.name, "time_offset"]
-    if len(offset) == 1:
-        return t + offset[0]
+    t = stream.seconds if seconds is None else seconds
     joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - RECORDING_MARGIN_S
-    assert len(joins) == len(offset) - 1
-    return t + offset[np.searchsorted(joins, t, side="right")]
+    restarts = len(values[stream.name, "time_offset"]) > 1
+    return t + _offsets(values, stream.name, np.searchsorted(joins, t, side="right") * restarts, t)
 
 
 def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
@@ -445,9 +448,47 @@ def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
     return np.searchsorted(state.starts, keyframe, side="right") - 1
 
 
-def offset_at(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
-    """Time offset (n,) s of a sensor's measurements at `keyframe` (n,)."""
-    return state.values[name, "time_offset"][clock_numbers(state, name, keyframe)]
+def offset_at(state: State, name: str, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Time offset (n,) s, with the drift, of a sensor's measurements at `keyframe` (n,) and `seconds` (n,) on its
+    clock."""
+    return _offsets(state.values, name, clock_numbers(state, name, keyframe), seconds)
+
+
+def drift_at(state: State, name: str, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Derivative (n,) of `offset_at` by the clock rate [s/ppm]."""
+    return _drift(state.values, name, clock_numbers(state, name, keyframe), seconds)
+
+
+def seconds_at(state: State, name: str) -> np.ndarray:
+    """Time (K,) s of each keyframe on the clock of a sensor, since its first stamp."""
+    clock = clock_numbers(state, name, np.arange(len(state.seconds)))
+    t = state.seconds - state.values[name, "time_offset"][clock]
+    if not _has_rate(state.values, name):
+        return t
+    middle = state.values[name, MIDDLE][clock]
+    return middle + (t - middle) / pace_of(state, name)
+
+
+def pace_of(state: State, name: str) -> float:
+    """Seconds of the body's clock for one of the clock of a sensor."""
+    return 1.0 + PPM * float(state.values[name, "clock_rate"][0]) if _has_rate(state.values, name) else 1.0
+
+
+def _offsets(values: Mapping[Key, np.ndarray], name: str, clock: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Time offsets (n,) s at `seconds` (n,) on a clock; clock (n,): number of the time offset."""
+    offset = values[name, "time_offset"][clock]
+    if not _has_rate(values, name):
+        return offset
+    return offset + values[name, "clock_rate"][0] * _drift(values, name, clock, seconds)
+
+
+def _drift(values: Mapping[Key, np.ndarray], name: str, clock: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Derivative (n,) of `_offsets` by the clock rate [s/ppm]."""
+    return PPM * (seconds - values[name, MIDDLE][clock]) if _has_rate(values, name) else np.zeros(len(seconds))
+
+
+def _has_rate(values: Mapping[Key, np.ndarray], name: str) -> bool:
+    return (name, MIDDLE) in values
 
 
 def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:
@@ -462,12 +503,13 @@ def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[t
 
 
 def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
-    """Calibration columns (7,) of a sensor's rotation (-1 if it has none), translation, and time offset number `clock`
-    or the only one."""
+    """Calibration columns (8,) of a sensor's rotation (-1 if it has none), translation, time offset number `clock` or
+    the only one, and clock rate."""
     offset = layout.columns(name, "time_offset")
     offset_column = offset[clock if len(offset) > 1 else 0]
     rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
-    return np.concatenate([rotation, layout.columns(name, "translation"), [offset_column]])
+    translation, rate = layout.columns(name, "translation"), layout.columns(name, "clock_rate")
+    return np.concatenate([rotation, translation, [offset_column], rate])
 
 
 # Placement of keyframes: at every distinct image instant, and evenly spaced between distant ones.

@@ -6,9 +6,9 @@ Here t is the time of the measurement plus the time offset. Perturbations d = (d
 along the sensor's axes: R <- R Exp(d_R), p <- p + R d_p. A factor differentiates its residual by d, and `add_chain`
 gives the derivatives by
 
-    keyframe 15 | next keyframe 15 | R_imu_sensor 3, p_imu_sensor 3, time offset 1, IMU intrinsics 24 or 0
+    keyframe 15 | next keyframe 15 | R_imu_sensor 3, p_imu_sensor 3, time offset 1, clock rate 1, IMU intrinsics 24 or 0
 
-The last four are calibration parameters, in this order (`Kinematics.columns`).
+The last five are calibration parameters, in this order (`Kinematics.columns`).
 """
 
 from __future__ import annotations
@@ -21,13 +21,22 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import Poses, offset_at, pose_columns, poses_at, poses_of_keyframes, poses_without_jacobians
+from icalib.motion.poses import (
+    Poses,
+    drift_at,
+    offset_at,
+    pose_columns,
+    poses_at,
+    poses_of_keyframes,
+    poses_without_jacobians,
+)
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows, UInt
 from icalib.optim.state import KEYFRAME_DIM, Layout, State
 from icalib.rig import Scheme
 
 OFFSET_COLUMN = 6  # index of the time offset among the calibration parameters of a pose
-N_POSE_PARAMETERS = 7  # extrinsics and time offset; the IMU intrinsics follow
+RATE_COLUMN = 7  # that of the clock rate
+N_POSE_PARAMETERS = 8  # extrinsics, time offset and clock rate; the IMU intrinsics follow
 IDENTITY_6 = np.eye(6)  # Jacobian of a pose by itself
 
 
@@ -64,7 +73,7 @@ class Kinematics:
         return cls(factor.name, factor.layout, factor.imu, factor.gravity)
 
     def columns(self, clock: int = 0) -> np.ndarray:
-        """Calibration columns (7 + 24 or 0,) of the sensor's pose, -1 where fixed; `clock`: number of its time
+        """Calibration columns (8 + 24 or 0,) of the sensor's pose, -1 where fixed; `clock`: number of its time
         offset."""
         columns = pose_columns(self.layout, self.sensor, clock)
         return np.concatenate([columns, self.layout.columns(self._imu, "intrinsics")]) if self._imu else columns
@@ -78,14 +87,15 @@ class Kinematics:
         """IMU poses at `seconds` (n,) on the sensor's clock, each from its `keyframe` (n,)."""
         if self.imu is None:
             return poses_of_keyframes(keyframe, state)
-        times = seconds + offset_at(state, self.sensor, keyframe)
+        times = seconds + offset_at(state, self.sensor, keyframe, seconds)
         if self.scheme == "inertial" and not jacobians:
             return poses_without_jacobians(times, keyframe, state, self.imu, self.gravity)
         return poses_at(self.scheme, times, keyframe, state, self.imu, self.gravity, bool(self._imu))
 
 
 class SensorPose(NamedTuple):
-    """n poses of a sensor, and rate, velocity and Jacobians of the IMU pose as in `Poses`."""
+    """n poses of a sensor, and rate, velocity and Jacobians of the IMU pose as in `Poses`. drift (n,): derivative of
+    its time by the clock rate [s/ppm]."""
 
     R_imu_sensor: np.ndarray
     p_imu_sensor: np.ndarray
@@ -96,6 +106,7 @@ class SensorPose(NamedTuple):
     J_keyframe: np.ndarray
     J_next: np.ndarray
     J_imu: np.ndarray
+    drift: np.ndarray
 
     @classmethod
     def at(
@@ -108,7 +119,9 @@ class SensorPose(NamedTuple):
         p_is = state.values[name, "translation"]
         R_sw = np.ascontiguousarray((imu.rotation @ R_is).transpose(0, 2, 1))
         p_ws = imu.position + imu.rotation @ p_is
-        return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_keyframe, imu.J_next, imu.J_imu)
+        timed = kinematics.imu is not None
+        drift = drift_at(state, name, keyframe, seconds) if timed else np.zeros(len(keyframe))
+        return cls(R_is, p_is, R_sw, p_ws, imu.rate, imu.velocity, imu.J_keyframe, imu.J_next, imu.J_imu, drift)
 
     @property
     def rotation(self) -> np.ndarray:
@@ -190,8 +203,11 @@ def add_chain(i, at, J_pose, J_imu_pose, first, calib, T):
                     T[r, at_keyframe + UInt(KEYFRAME_DIM) + j] += f * J_next[x, k, j]
             for j in range(n_imu):
                 T[r, imu + j] += f * J_imu[x, k, j]
-        for k in range(UInt(3)):
-            T[r, offset] += J_imu_pose[r, k] * rate[x, k] + J_imu_pose[r, UInt(3) + k] * velocity[x, k]
+        by_time = 0.0
+        for k in range(3):
+            by_time += J_imu_pose[r, k] * rate[x, k] + J_imu_pose[r, UInt(3) + k] * velocity[x, k]
+        T[r, offset] += by_time
+        T[r, mounted + UInt(RATE_COLUMN)] += by_time * at.drift[x]
         for j in range(UInt(3)):
             T[r, mounted + j] += J_pose[r, j]
             for k in range(UInt(3)):

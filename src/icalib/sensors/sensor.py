@@ -52,6 +52,21 @@ TIME_OFFSET = ParameterSpec(
     motion="turn or shake the rig faster, so that a time shift shows",
     motion_on_wheels="speed up, brake and turn more",
 )
+# Rate of the reference clock against that of the sensor, less 1: t_reference = t + time_offset + rate (t - t_mid). At
+# t_mid the reference clock is in the middle of its recording. By their data sheets, quartz oscillators are within
+# 50 ppm.
+CLOCK_RATE = ParameterSpec(
+    name="clock_rate",
+    size=1,
+    manifold="nuisance",
+    unit="ppm",
+    labels=("clock_rate",),
+    tolerance=10.0,
+    prior_sigma=50.0,
+    is_auxiliary=True,
+    meaning="how much more time passes on the clock of the reference",
+    motion="record longer",
+)
 MOUNTED = (ROTATION, TRANSLATION, TIME_OFFSET)  # parameters of every `MountedSensor`
 MOUNTED_NAMES = tuple(spec.name for spec in MOUNTED)
 TARGET_FRAME = "target"  # name of the target's frame in the rig file
@@ -180,12 +195,14 @@ class Sensor:
 
 @dataclass(frozen=True, kw_only=True)
 class ClockedSensor(Sensor):
-    """A sensor with a clock that differs from that of the reference sensor: t_reference = t + time_offset [s].
+    """A sensor with a clock that differs from that of the reference sensor: t_reference = t + time_offset + clock_rate
+    (t - t_mid), see `CLOCK_RATE`. Where the time offset is fixed, so is the rate.
 
     clock_restarts: each recording has a separate time offset.
     """
 
     time_offset: Parameter = Parameter()
+    clock_rate: Parameter = Parameter()
     clock_restarts: bool = False
 
 
@@ -197,7 +214,7 @@ class MountedSensor(ClockedSensor):
     `Rig.reference`.
     """
 
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = MOUNTED
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE)
 
     rotation: Parameter = Parameter()
     translation: Parameter = Parameter()

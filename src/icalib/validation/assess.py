@@ -27,6 +27,7 @@ from icalib.estimate.residual_statistics import (
 from icalib.estimate.solver import Visit
 from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
+from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
@@ -49,8 +50,8 @@ from icalib.result.calibration import Timeline, row_record, versions
 from icalib.result.verdict import AUXILIARY, failure_words
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
-from icalib.sensors.sensor import MOUNTED_NAMES
-from icalib.validation.causes import all_causes, scatter_warnings
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED_NAMES
+from icalib.validation.causes import all_causes, pace_words, scatter_warnings
 from icalib.validation.guesses import guess_notes
 
 
@@ -333,8 +334,27 @@ def notes(assessed: AssessedEstimate) -> Iterator[Remark]:
         timed = f"{span.end - span.start:.1f} s from {span.origin_ns} ns on"
         yield Remark("recording_span", f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}.")
     yield from assessed.inputs.measurements.notes
+    yield from _clock_rate_notes(assessed)
     for assessment in assessments(assessed):
         yield from assessment.notes
+
+
+CLOCK_RATE_SIGMAS = 5.0  # standard deviations from which a clock rate is named
+
+
+def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
+    """A note on each clock whose rate differs from that of the body, by more than the time tolerance over the
+    recording."""
+    rig, duration = assessed.inputs.rig, float(np.ptp(assessed.estimate.outcome.state.seconds))
+    for g in assessed.groups:
+        rate, std = (float(x[0]) for x in (g.value, g.std)) if g.name == CLOCK_RATE.name else (0.0, 0.0)
+        drift_s = PPM * abs(rate) * duration
+        if g.columns is not None and abs(rate) > CLOCK_RATE_SIGMAS * std and drift_s > rig.settings.time_tolerance_s:
+            sentence = (
+                f"the clock of {g.sensor} runs {pace_words(rate, std)} against that of {rig.reference}, "
+                f"{1e3 * drift_s:.2g} ms over the recording; the estimate includes it as clock_rate."
+            )
+            yield Remark("clock_rate_estimated", sentence)
 
 
 # Two-fold cross-validation, in the form of the result.

@@ -251,18 +251,25 @@ def _clock_words(c: Change, others: list[str], segments: Segments, when: str, ti
     """A sentence on a time offset that drifts or jumps. others: clocks that explain as much."""
     instead = f" (or that of {', or of '.join(others)} the opposite way)" if others else ""
     if c.pattern == "drift":
-        span = float(np.ptp(segments.state.seconds[segments.ends]))
+        rate = 1e6 * float(c.value[0]) / float(np.ptp(segments.state.seconds[segments.ends]))
+        wider = 10.0 ** np.ceil(np.log10(abs(rate)))
         return Remark(
             "clock_drifts",
-            f"the clock of {_names(c)}{instead} drifts against the others by about {1e6 * c.value[0] / span:+.0f} ppm, "
-            f"{1e3 * abs(c.value[0]):.2g} ms {when}. Stamp all sensors by one clock (hardware trigger, PTP) "
-            "and record again.",
+            f"the clock of {_names(c)}{instead} runs about {pace_words(rate)} against the others, "
+            f"{1e3 * abs(c.value[0]):.2g} ms {when}. Write clock_rate: {{prior: 0, sigma: {wider:.0f}}}, and leave "
+            "time_offset free; or stamp all sensors by one clock, and record again.",
         )
     return Remark(
         "clock_jumps",
         f"the time offset of {_names(c)}{instead} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock "
         f"jumped, or stamps are wrong{_apart(c, timeline, '. Calibrate the recording before or after that alone')}.",
     )
+
+
+def pace_words(rate_ppm: float, std: float | None = None) -> str:
+    """How fast or slow a clock is, from its clock_rate [ppm]: the rate of a fast clock is negative."""
+    spread = "" if std is None else f" +- {std:.2g}"
+    return f"{abs(rate_ppm):.0f}{spread} ppm {'fast' if rate_ppm < 0.0 else 'slow'}"
 
 
 def _apart(c: Change, timeline: Timeline, words: str) -> str:

@@ -187,7 +187,7 @@ class CornerFactor(FactorDefaults):
 
     def instants(self, state: State) -> np.ndarray:
         """(M,) instants of the images, s on the body's clock since its first stamp."""
-        return self.times + offset_at(state, self.name, self.keyframe)
+        return self.times + offset_at(state, self.name, self.keyframe, self.times)
 
     def lens(self, state: State) -> np.ndarray:
         """(P,) parameters of the camera model: intrinsics, then distortion."""

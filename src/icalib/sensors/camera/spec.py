@@ -19,7 +19,7 @@ from icalib.sensors.fields import (
     topic_or_none,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec, check_sizes
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sensor, TableLayout
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sensor, TableLayout
 
 INTRINSICS = ParameterSpec(
     name="intrinsics",
@@ -74,7 +74,7 @@ class Camera(MountedSensor):
     readings: ClassVar[str] = "images"
     gives_motion: ClassVar[bool] = True
     sees_target: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, DISTORTION, BLOOM)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, INTRINSICS, DISTORTION, BLOOM)
     lens: ClassVar[tuple[str, ...]] = LENS
     may_change: ClassVar[tuple[tuple[str, ...], ...]] = (*MountedSensor.may_change, (INTRINSICS.name,))
 
@@ -106,7 +106,7 @@ class Camera(MountedSensor):
             tolerance=scale * DISTORTION.tolerance,
             prior_sigma=scale * DISTORTION.prior_sigma,
         )
-        return (*MOUNTED, INTRINSICS, distortion, BLOOM)
+        return (*MOUNTED, CLOCK_RATE, INTRINSICS, distortion, BLOOM)
 
     @property
     def tracks_images(self) -> bool:

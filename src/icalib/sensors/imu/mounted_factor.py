@@ -19,7 +19,7 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
 from icalib.motion.imu_data import ImuData, clear_of, without_size_effect
-from icalib.motion.poses import EstimatedMotion, gravity_of, offset_at
+from icalib.motion.poses import EstimatedMotion, gravity_of, seconds_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, add_pose_chain
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece
 from icalib.optim.rows import Rows
@@ -87,8 +87,7 @@ class MountedImuFactor(RowFactor):
     def build(cls, readings: ImuData, motion: EstimatedMotion, layout: Layout) -> MountedImuFactor:
         """Preintegrates all intervals in which the IMU ran, at the state of `motion`."""
         state, name = motion.state, readings.name
-        n = len(state.seconds)
-        seconds = state.seconds - offset_at(state, name, np.arange(n))
+        seconds = seconds_at(state, name)
         intrinsics, bias = state.values[name, "intrinsics"], _imu_states(layout, state, name)[:, 3:]
         usable = readings.covers(seconds[:-1], seconds[1:]) & clear_of(readings.seams, seconds[:-1], seconds[1:])
         usable[np.array(state.starts[1:], dtype=np.int64) - 1] = False

@@ -147,7 +147,7 @@ class LidarFactor(RowFactor):
 
     def times(self, state: State) -> np.ndarray:
         """(E,) centre of the bin of each entry on the IMU's clock [s]."""
-        at = self.moments.seconds + offset_at(state, self.name, self.keyframe)
+        at = self.moments.seconds + offset_at(state, self.name, self.keyframe, self.moments.seconds)
         return np.repeat(at, np.diff(self.moments.start))
 
     def rms(self, out: Whitened, kind: str) -> tuple[float, str]:

@@ -96,7 +96,8 @@ class SimLidar(SimSensor):
             progress((i + 1) / len(seconds))
         n = start[-1]
         plane[:n][plane[:n] >= len(scene.room.faces)] = -1  # boards are no planes of the room
-        return Report(LidarStream(self.name, stamps, start, offset[:n], xyz[:n], plane[:n]))
+        late = offset[:n] / (1.0 + 1e-6 * self.clock_rate_ppm)
+        return Report(LidarStream(self.name, stamps, start, late, xyz[:n], plane[:n]))
 
     def rig_entry(self) -> Lidar:
         near, far = self.range_m

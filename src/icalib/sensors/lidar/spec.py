@@ -17,7 +17,7 @@ from icalib.sensors.fields import (
     topic_or_none,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
-from icalib.sensors.sensor import MOUNTED, Lack, MountedSensor, Sensor, TimeUnit
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED, Lack, MountedSensor, Sensor, TimeUnit
 
 RANGE_OFFSET = ParameterSpec(
     name="range_offset",
@@ -50,7 +50,7 @@ class Lidar(MountedSensor):
     readings: ClassVar[str] = "scans"
     gives_motion: ClassVar[bool] = True
     shows_planes: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, RANGE_OFFSET)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, RANGE_OFFSET)
 
     path: str
     range_noise_m: float | None = None  # sigma along the beam; None: estimated from the residuals

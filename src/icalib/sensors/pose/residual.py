@@ -109,7 +109,7 @@ class PoseFactor(RowFactor, ABC):
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.instants + offset_at(state, self.name, self.keyframes)
+        return self.instants + offset_at(state, self.name, self.keyframes, self.instants)
 
     def raw(self, out: Whitened) -> np.ndarray:
         """(n, 6) residuals [rad, m]."""

@@ -22,7 +22,17 @@ from icalib.sensors.fields import (
     topic_or_none,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, Lack, MountedSensor, Sensor, TableLayout, has_imu
+from icalib.sensors.sensor import (
+    CLOCK_RATE,
+    MOUNTED,
+    PLAIN_TABLE,
+    Axes,
+    Lack,
+    MountedSensor,
+    Sensor,
+    TableLayout,
+    has_imu,
+)
 
 PoseKind = Literal["absolute", "relative"]
 LengthUnit = Literal["m", "cm", "mm"]
@@ -68,7 +78,7 @@ class PoseSensor(MountedSensor):
     noun: ClassVar[str] = "pose sensor"
     readings: ClassVar[str] = "poses"
     gives_motion: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, POSE_SCALE)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, POSE_SCALE)
 
     path: str
     kind: PoseKind = "absolute"

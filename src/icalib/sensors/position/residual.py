@@ -133,7 +133,7 @@ class PositionFactor(RowFactor):
         return Whitened.empty(len(self.seconds), 3)
 
     def times(self, state: State) -> np.ndarray:
-        return self.seconds + offset_at(state, self.name, self.keyframe)
+        return self.seconds + offset_at(state, self.name, self.keyframe, self.seconds)
 
     def raw(self, out: Whitened) -> np.ndarray:
         """(n, 3) residuals in the frame's axes [m]."""

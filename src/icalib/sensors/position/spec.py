@@ -20,6 +20,7 @@ from icalib.sensors.fields import (
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
 from icalib.sensors.sensor import (
+    CLOCK_RATE,
     PLAIN_TABLE,
     TIME_OFFSET,
     TRANSLATION,
@@ -54,7 +55,7 @@ class PositionSensor(ClockedSensor):
 
     sensor_type: ClassVar[str] = "position"
     noun: ClassVar[str] = "position sensor"
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET, CLOCK_RATE)
     readings: ClassVar[str] = "positions"
     gives_motion: ClassVar[bool] = True
 

@@ -9,7 +9,8 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import cross3, mulv3, tmul3, tmulv3
-from icalib.motion.sensor_pose import N_POSE_PARAMETERS, OFFSET_COLUMN
+from icalib.motion.poses import PPM
+from icalib.motion.sensor_pose import OFFSET_COLUMN
 from icalib.optim.rows import KEYFRAME_PAIR_DIM
 from icalib.optim.state import KEYFRAME_DIM
 from icalib.rig import WheelKind
@@ -23,20 +24,24 @@ from icalib.rig import WheelKind
 #     X = R_imu_wheel^T Y,  T = R_imu_wheel^T Theta,  Theta = Log(R_world_imu(s_0)^T R_world_imu(s_1))
 #
 # A row of the model (`drive_rows`) is g_X X + g_T T = a_Y Y + a_T Theta. All rows share the Jacobians J (6, ...) of
-# (D, Theta): rows 0 to 2 for D, rows 3 to 5 for Theta. J_calib (6, 1 + 24 or 0): by time offset and IMU intrinsics.
+# (D, Theta): rows 0 to 2 for D, rows 3 to 5 for Theta. J_calib (6, 2 + 24 or 0): by time offset, clock rate and IMU
+# intrinsics.
 
 
 class WheelParameters(NamedTuple):
     """Extrinsics R = R_imu_wheel (3, 3), p = p_imu_wheel (3,) [m], and drive (N_DRIVE,), see `coefficients`; for a
-    pair left radius, right radius, baseline and unit of length [m]."""
+    pair left radius, right radius, baseline and unit of length [m]. pace: see
+    `pace_of`."""
 
     R: np.ndarray
     p: np.ndarray
     drive: np.ndarray
+    pace: float
 
 
 class MotionSamples(NamedTuple):
-    """The motion of the IMU at m instants, each propagated from a keyframe: keyframe (m,) and fields of `Poses`."""
+    """The motion of the IMU at m instants, each propagated from a keyframe: keyframe (m,), fields of `Poses`, and drift
+    (m,), the derivative of the instant by the clock rate [s/ppm]."""
 
     keyframe: np.ndarray
     rotation: np.ndarray
@@ -45,33 +50,37 @@ class MotionSamples(NamedTuple):
     velocity: np.ndarray
     J_keyframe: np.ndarray
     J_imu: np.ndarray
+    drift: np.ndarray
 
 
 @njit(cache=True, nogil=True)
 def _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians):
     """Theta (3,) between samples a and b. Adds its derivatives by the two keyframes to rows 3: of J_first and J_second
-    (6, 15), and those by time offset and IMU intrinsics to rows 3: of J_calib."""
+    (6, 15), and those by time offset, clock rate and IMU intrinsics to rows 3: of J_calib."""
     theta = so3.log(tmul3(samples.rotation[a], samples.rotation[b]))
     if not with_jacobians:
         return theta
     J_left, J_right = so3.left_jacobian_inverse(theta), so3.right_jacobian_inverse(theta)
     for i in range(3):
         for j in range(3):
-            J_calib[3 + i, 0] += J_right[i, j] * samples.rate[b, j] - J_left[i, j] * samples.rate[a, j]
+            at_end, at_start = J_right[i, j] * samples.rate[b, j], J_left[i, j] * samples.rate[a, j]
+            J_calib[3 + i, 0] += at_end - at_start
+            J_calib[3 + i, 1] += at_end * samples.drift[b] - at_start * samples.drift[a]
             for c in range(KEYFRAME_DIM):
                 J_first[3 + i, c] -= J_left[i, j] * samples.J_keyframe[a, j, c]
                 J_second[3 + i, c] += J_right[i, j] * samples.J_keyframe[b, j, c]
             for c in range(samples.J_imu.shape[2]):
-                J_calib[3 + i, 1 + c] += (
+                J_calib[3 + i, 2 + c] += (
                     J_right[i, j] * samples.J_imu[b, j, c] - J_left[i, j] * samples.J_imu[a, j, c]
                 )  # fmt: skip
     return theta
 
 
 @njit(cache=True, nogil=True)
-def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, with_jacobians):
-    """Adds weight * R^T v of sample j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and J_calib."""
-    R = samples.rotation[j]
+def _add_displacement(j, duration, pace, samples, velocities, D, J_keyframe, J_calib, with_jacobians):
+    """Adds pace * duration * R^T v of sample j to D (3,), and its derivatives to rows :3 of J_keyframe (6, 15) and
+    J_calib."""
+    R, weight = samples.rotation[j], pace * duration
     u = tmulv3(R, samples.velocity[j])
     for i in range(3):
         D[i] += weight * u[i]
@@ -82,21 +91,24 @@ def _add_displacement(j, weight, samples, velocities, D, J_keyframe, J_calib, wi
     acceleration = tmulv3(R, velocities.acceleration[j])
     J_u_rotation = so3.hat(u)
     for i in range(3):
-        J_calib[i, 0] += weight * (turning[i] + acceleration[i])
+        by_time = weight * (turning[i] + acceleration[i])
+        J_calib[i, 0] += by_time
+        J_calib[i, 1] += by_time * samples.drift[j] + PPM * duration * u[i]
         for k in range(3):
             for c in range(KEYFRAME_DIM):
                 J_keyframe[i, c] += weight * (
                     J_u_rotation[i, k] * samples.J_keyframe[j, k, c] + R[k, i] * velocities.J_keyframe[j, k, c]
                 )
             for c in range(samples.J_imu.shape[2]):
-                J_calib[i, 1 + c] += weight * (
+                J_calib[i, 2 + c] += weight * (
                     J_u_rotation[i, k] * samples.J_imu[j, k, c] + R[k, i] * velocities.J_imu[j, k, c]
                 )
 
 
 @njit(cache=True, nogil=True)
 def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
-    """Fills the derivatives of row q of interval i by keyframes, R_imu_wheel, time offset and IMU intrinsics."""
+    """Fills the derivatives of row q of interval i by keyframes, R_imu_wheel, time offset, clock rate and IMU
+    intrinsics."""
     # R <- R Exp(d) rotates X and T by -d: dX = X x d, dT = T x d.
     x, t = cross3(gX, X), cross3(gT, T)
     for c in range(3):
@@ -105,10 +117,9 @@ def _fill_motion(i, q, gX, gT, aY, aT, X, T, J_first, J_second, J_calib, rows):
         for c in range(KEYFRAME_DIM):
             rows.J[i, q, c] += aY[k] * J_first[k, c] + aT[k] * J_first[3 + k, c]
             rows.J[i, q, KEYFRAME_DIM + c] += aY[k] * J_second[k, c] + aT[k] * J_second[3 + k, c]
-        rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET_COLUMN] += aY[k] * J_calib[k, 0] + aT[k] * J_calib[3 + k, 0]
-        for c in range(J_calib.shape[1] - 1):
-            rows.J[i, q, KEYFRAME_PAIR_DIM + N_POSE_PARAMETERS + c] += (
-                aY[k] * J_calib[k, 1 + c] + aT[k] * J_calib[3 + k, 1 + c]
+        for c in range(J_calib.shape[1]):
+            rows.J[i, q, KEYFRAME_PAIR_DIM + OFFSET_COLUMN + c] += (
+                aY[k] * J_calib[k, c] + aT[k] * J_calib[3 + k, c]
             )  # fmt: skip
 
 
@@ -140,7 +151,7 @@ def increment_rows(start, weights, samples, velocities, wheels, coefficients, me
     measured (n, 4). Jacobians are skipped if those of `rows` are empty.
     """
     with_jacobians = len(rows.J) > 0
-    n_calib = 1 + samples.J_imu.shape[2]
+    n_calib = 2 + samples.J_imu.shape[2]
     J_first, J_second, J_calib = np.empty((6, KEYFRAME_DIM)), np.empty((6, KEYFRAME_DIM)), np.empty((6, n_calib))
     D = np.empty(3)
     for i in range(len(start) - 1):
@@ -148,7 +159,7 @@ def increment_rows(start, weights, samples, velocities, wheels, coefficients, me
         J_first[:], J_second[:], J_calib[:], D[:] = 0.0, 0.0, 0.0, 0.0
         for j in range(a + 1, b):
             J_keyframe = J_first if samples.keyframe[j] == samples.keyframe[a] else J_second
-            _add_displacement(j, weights[j], samples, velocities, D, J_keyframe, J_calib, with_jacobians)
+            _add_displacement(j, weights[j], wheels.pace, samples, velocities, D, J_keyframe, J_calib, with_jacobians)
         theta = _rotation_between(a, b, samples, J_first, J_second, J_calib, with_jacobians)
         X, T = tmulv3(wheels.R, D + cross3(theta, wheels.p)), tmulv3(wheels.R, theta)
         for q in range(4):

@@ -39,11 +39,14 @@ from icalib.motion.poses import (
     EstimatedMotion,
     Poses,
     VelocityDerivatives,
+    drift_at,
     instants,
     offset_at,
+    pace_of,
     poses_and_velocity_derivatives,
     poses_at,
     poses_without_jacobians,
+    seconds_at,
     slices_by_clock,
 )
 from icalib.motion.sensor_pose import N_POSE_PARAMETERS, Kinematics, SensorPose, rows_at
@@ -215,30 +218,30 @@ class IncrementFactor(WheelFactor):
         measured[:, :n_measured] = increments[:, :n_measured]
         mean = increments[:, 1:] / dt[:, None]
         k = intervals.keyframe
-        change = state.seconds[k + 1] - offset_at(state, name, k) if imu.forwards else None
+        change = seconds_at(state, name)[k + 1] if imu.forwards else None
         instants = quadrature(seconds, intervals, change)
         return cls(name, kind, intervals, measured, mean, whitening, instants, imu, motion.gravity, noise, layout)
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.instants.times[self.instants.start[:-1]] + offset_at(state, self.name, self.intervals.keyframe)
+        starts = self.instants.times[self.instants.start[:-1]]
+        return starts + offset_at(state, self.name, self.intervals.keyframe, starts)
 
     def _added(self, block: slice, state: State, into: Into) -> float:
         start = self.instants.start[block.start : block.stop + 1]
         used = slice(int(start[0]), int(start[-1]))
         keyframe = self.instants.keyframe[used]
-        times = self.instants.times[used] + offset_at(state, self.name, keyframe)
+        seconds = self.instants.times[used]
+        times = seconds + offset_at(state, self.name, keyframe, seconds)
         poses, velocities = _motion(self, times, keyframe, state, into.sums)
         rows = Rows.empty(len(start) - 1, 4, N_POSE_PARAMETERS + poses.J_imu.shape[2] + N_DRIVE, into.sums)
         drive = np.append(drive_of(self.name, state, self.kind), self.imu.unit_length(state))
-        wheels = WheelParameters(
-            np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"], drive
-        )
+        mount = np.ascontiguousarray(state.values[self.name, "rotation"]), state.values[self.name, "translation"]
+        wheels = WheelParameters(*mount, drive, pace_of(state, self.name))
         c = coefficients(self.kind, wheels.drive, self.mean[block])
-        increment_rows(
-            start - start[0], self.instants.weight[used], _samples(keyframe, poses), velocities, wheels, c,
-            self.measured[block], rows,
-        )  # fmt: skip
+        samples = _samples(keyframe, poses, drift_at(state, self.name, keyframe, seconds))
+        weights, measured = self.instants.weight[used], self.measured[block]
+        increment_rows(start - start[0], weights, samples, velocities, wheels, c, measured, rows)
         return self._add(block, rows, state, into)
 
 
@@ -316,7 +319,8 @@ class RelativePoseFactor(WheelFactor):
 
     def times(self, state: State) -> np.ndarray:
         """See `RowFactor`."""
-        return self.seconds[self.intervals.first] + offset_at(state, self.name, self.intervals.keyframe)
+        starts = self.seconds[self.intervals.first]
+        return starts + offset_at(state, self.name, self.intervals.keyframe, starts)
 
     def _added(self, block: slice, state: State, into: Into) -> float:
         i, z, kinematics = self.intervals, self.poses, Kinematics.of(self)
@@ -386,8 +390,8 @@ def _motion(
     return poses_and_velocity_derivatives(times, keyframe, state, factor.imu, factor.gravity, free)
 
 
-def _samples(keyframe: np.ndarray, p: Poses) -> MotionSamples:
-    return MotionSamples(keyframe, p.rotation, p.position, p.rate, p.velocity, p.J_keyframe, p.J_imu)
+def _samples(keyframe: np.ndarray, p: Poses, drift: np.ndarray) -> MotionSamples:
+    return MotionSamples(keyframe, p.rotation, p.position, p.rate, p.velocity, p.J_keyframe, p.J_imu, drift)
 
 
 # Propagated IMU noise in recorded relative poses of wheels whose end points lie between keyframes.

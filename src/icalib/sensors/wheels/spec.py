@@ -23,7 +23,7 @@ from icalib.sensors.fields import (
     topic_or_none,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec, check_sizes
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sampling, Sensor, TableLayout
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED, PLAIN_TABLE, Lack, MountedSensor, Sampling, Sensor, TableLayout
 
 WheelFactor = Literal["increments", "relative-poses"]
 WheelMeasure = Literal["rates", "angles", "ticks", "poses", "twist"]
@@ -149,6 +149,7 @@ class Wheels(MountedSensor):
     drives: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
+        CLOCK_RATE,
         GROUND_HEIGHT,
         *(spec for drive in DRIVES.values() for spec in drive),
     )
@@ -184,8 +185,9 @@ class Wheels(MountedSensor):
         check_sizes(self, self.stated())  # also those of other drives
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Sensor`: extrinsics, time offset, drive parameters, and the height if it is estimated."""
-        return (*MOUNTED, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
+        """See `Sensor`: extrinsics, time offset, clock rate, drive parameters, and the height if it is
+        estimated."""
+        return (*MOUNTED, CLOCK_RATE, *((GROUND_HEIGHT,) if self.knows_height else ()), *self.drive_specs)
 
     def is_estimated(self, spec: ParameterSpec) -> bool:
         """See `Sensor`; drive parameters are not estimated from relative poses, which do not depend on them."""

@@ -22,7 +22,7 @@ from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.rig.file import load_rig
 from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.parameter import display_unit
-from icalib.sensors.sensor import ROTATION, TIME_OFFSET, TRANSLATION
+from icalib.sensors.sensor import CLOCK_RATE, ROTATION, TIME_OFFSET, TRANSLATION
 
 _GRID = (24, 18)  # columns and rows of the grid of pixels at which lenses are compared
 
@@ -262,8 +262,8 @@ DENSITIES = {
 
 def compared_specs(kind: type[Sensor]) -> dict[str, ParameterSpec]:
     """The parameters of a kind of sensor that are compared as quantities, by name. Extrinsics are compared as poses,
-    and parameters of a lens by projection."""
-    return {s.name: s for s in kind.stated() if s not in (ROTATION, TRANSLATION) and not s.by_images}
+    and parameters of a lens by projection. The rate of a clock changes with its temperature."""
+    return {s.name: s for s in kind.stated() if s not in (ROTATION, TRANSLATION, CLOCK_RATE) and not s.by_images}
 
 
 def noise_quantities(imu: str, noise: dict[str, Any]) -> dict[tuple[str, str], Quantity]:

@@ -12,7 +12,7 @@ from icalib.tools.simulation.motion import inside
 from icalib.tools.simulation.projection import image_velocity, project, visible
 from icalib.tools.simulation.room import Room, distances
 from icalib.tools.simulation.scenario import Scenario, SimCamera
-from icalib.tools.simulation.trajectory import Features, TrueTrajectory, check_enough
+from icalib.tools.simulation.trajectory import Features, TrueTrajectory, by_clock, check_enough
 
 _MIN_CORNERS = 6  # images with fewer are dropped
 _LEAD_S = 0.05  # images start this long after the IMU, and end this long before it
@@ -50,10 +50,9 @@ def image_stamps(scenario: Scenario, camera: SimCamera, rng: np.random.Generator
     span = scenario.duration_s - 2.0 * _LEAD_S - camera.phase_s
     taken = _LEAD_S + camera.phase_s + np.arange(int(span * camera.rate_hz) + 1) / camera.rate_hz
     taken += rng.uniform(-camera.jitter_s, camera.jitter_s, len(taken))
-    since_origin = np.round((taken - camera.time_offset_s) * 1e9).astype(np.int64)
-    seconds = since_origin.astype(np.float64) * 1e-9 + camera.time_offset_s
+    stamps, seconds = by_clock(camera, taken, 0.5 * scenario.duration_s)
     kept = ~inside(camera.dropouts, seconds)
-    return since_origin[kept] + np.int64(camera.clock_origin_ns), seconds[kept]
+    return stamps[kept], seconds[kept]
 
 
 def see_corners(

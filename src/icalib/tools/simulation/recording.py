@@ -13,7 +13,7 @@ import numpy as np
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets.base import BOARD
-from icalib.sensors.sensor import mounted
+from icalib.sensors.sensor import CLOCK_RATE, mounted
 from icalib.tools.simulation.corners import CornerTruth, SimulatedTracks, TrackTruth, follow, see_corners
 from icalib.tools.simulation.ground import ground_motion
 from icalib.tools.simulation.motion import (
@@ -140,7 +140,8 @@ def simulate(scenario: Scenario, seed: int, progress: Progress = lambda stage, d
 def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, np.ndarray]:
     """True parameters of a sensor by their names in the rig, extrinsics and time offset included."""
     T, offset = sensor.T_imu_sensor, np.array([raw_time_offset(scenario, sensor)])
-    return {**mounted(T[:3, :3], T[:3, 3], offset), **sensor.true_parameters().values}
+    rate = {CLOCK_RATE.name: np.array([sensor.clock_rate_ppm])}
+    return {**mounted(T[:3, :3], T[:3, 3], offset), **rate, **sensor.true_parameters().values}
 
 
 def _motion(scenario: Scenario, seed: int) -> TrueTrajectory:

@@ -81,7 +81,7 @@ class SimSensor(ABC):
     """A simulated sensor that is rigidly mounted to the IMU and has a separate clock.
 
     T_imu_sensor (4, 4): p_imu = T_imu_sensor p_sensor. Measurement i is taken at phase_s + i / rate_hz on the IMU's
-    clock, and stamped by the sensor's clock, as images of `SimCamera`.
+    clock, and stamped by the sensor's clock, as images of `SimCamera`, by whose clock_rate_ppm it drifts.
 
     Class variables: sensor_type, as in the rig file; random_stream, number of the first sensor's random stream, at
     least 1000 apart from those of other kinds; measures, noun for its measurements in messages; rolls, whether its
@@ -98,6 +98,7 @@ class SimSensor(ABC):
     name: str
     T_imu_sensor: np.ndarray
     time_offset_s: float = 0.0
+    clock_rate_ppm: float = 0.0
     rate_hz: float = 10.0
     phase_s: float = 0.0
     clock_origin_ns: int = 0
@@ -367,10 +368,10 @@ class SimCamera:
     """A simulated camera, with its true parameters.
 
     Image i is taken at phase_s + i / rate_hz on the IMU's clock, and stamped by the camera's clock. Its stamp follows
-    from t_imu = t_cam + time_offset_s, each since the origin of its clock. Stamps are rounded to ns, and the truth is
-    evaluated at the rounded stamp. intrinsics: fx, fy, cx, cy [px]. bloom_px: edge bloom, which moves each corner in
-    the image towards the centre of its tag. dropouts: there are no images in these intervals. Raises RigError for an
-    unknown model.
+    from t_imu = t_cam + time_offset_s + 1e-6 clock_rate_ppm (t_cam - t_mid), each since the origin of its clock; t_mid
+    is the middle of the recording. Stamps are rounded to ns, and the truth is evaluated at the rounded stamp.
+    intrinsics: fx, fy, cx, cy [px]. bloom_px: edge bloom, which moves each corner in the image towards the centre of
+    its tag. dropouts: there are no images in these intervals. Raises RigError for an unknown model.
     """
 
     name: str
@@ -380,6 +381,7 @@ class SimCamera:
     distortion: tuple[float, ...]
     T_imu_sensor: np.ndarray  # (4, 4)
     time_offset_s: float = 0.0
+    clock_rate_ppm: float = 0.0
     rate_hz: float = 20.0
     phase_s: float = 0.0
     clock_origin_ns: int = 0
@@ -574,7 +576,7 @@ def _euroc_cameras(phase_s: float) -> tuple[SimCamera, SimCamera]:
 # Reads fields of a scenario file that several sections share.
 
 CLOCK = ("T_imu_sensor", "rate")
-CLOCK_OPTIONS = ("time_offset", "phase")
+CLOCK_OPTIONS = ("time_offset", "clock_rate", "phase")
 
 
 def mounted_fields(
@@ -587,6 +589,7 @@ def mounted_fields(
     common = {
         "T_imu_sensor": pose(fields["T_imu_sensor"]),
         "time_offset_s": fields["time_offset"].number() if "time_offset" in fields else 0.0,
+        "clock_rate_ppm": fields["clock_rate"].number() if "clock_rate" in fields else 0.0,
         "rate_hz": fields["rate"].positive(),
         "phase_s": at_least(fields["phase"], 0.0) if "phase" in fields else 0.0,
         "clock_origin_ns": start_ns,

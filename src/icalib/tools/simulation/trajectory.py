@@ -149,6 +149,8 @@ class Clocked(Protocol):
     @property
     def time_offset_s(self) -> float: ...
     @property
+    def clock_rate_ppm(self) -> float: ...
+    @property
     def rate_hz(self) -> float: ...
     @property
     def phase_s(self) -> float: ...
@@ -162,8 +164,15 @@ def stamped(sensor: Clocked, end_s: float) -> tuple[np.ndarray, np.ndarray]:
     begin = LEAD_S + sensor.phase_s
     nominal = begin + np.arange(int((end_s - begin) * sensor.rate_hz + 1e-9) + 1) / sensor.rate_hz
     check_enough(sensor.name, nominal)
-    since_origin = np.round((nominal - sensor.time_offset_s) * 1e9).astype(np.int64)
-    seconds = since_origin.astype(np.float64) * 1e-9 + sensor.time_offset_s
+    return by_clock(sensor, nominal, 0.5 * (end_s + LEAD_S))
+
+
+def by_clock(sensor: Clocked, taken: np.ndarray, middle_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Stamps (M,) int64 [ns] that the sensor's clock gives to instants `taken` (M,) [s] on the IMU's clock since its
+    origin, and the instants (M,) that the rounded stamps mean. middle_s: when the offset is time_offset_s."""
+    pace, middle = 1.0 + 1e-6 * sensor.clock_rate_ppm, middle_s - sensor.time_offset_s
+    since_origin = np.round((middle + (taken - middle_s) / pace) * 1e9).astype(np.int64)
+    seconds = middle_s + pace * (since_origin.astype(np.float64) * 1e-9 - middle)
     return since_origin + np.int64(sensor.clock_origin_ns), seconds
 
 
