@@ -22,6 +22,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
+from icalib.sensors.sensor import CLOCK_RATE
 from icalib.tools.montecarlo.record import error, true_value
 from icalib.tools.simulation import Simulation, rig_for
 
@@ -124,18 +125,19 @@ def truth_of(run: Run, sensor: str, name: str) -> np.ndarray | None:
 
 
 def known(count: int | None = None) -> Check:
-    """All that is called known is off by less than four standard deviations. count: of the numbers compared."""
+    """All that is called known is off by less than four standard deviations. count: of the numbers compared, but for
+    rates of clocks."""
 
     def check(run: Run) -> None:
         found = list(compared(run))
         far = [c for c in found if (np.abs(c.error) > MOST_SIGMA * c.std)[c.is_known].any()]
         assert not far, far
-        assert count in (None, sum(len(c.error) for c in found))
+        assert count in (None, sum(len(c.error) for c in found if c.name != CLOCK_RATE.name))
 
     return check
 
 
-SI = {"clock_rate": 1e6}  # ppm
+SI = {CLOCK_RATE.name: 1e6}  # ppm
 
 
 def exact(bound: float, lens: float = 0.0, least: float = 1e-9) -> Check:

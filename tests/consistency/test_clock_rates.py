@@ -39,12 +39,12 @@ FIXES = SimPositions("gnss0", T_IMU_MOCAP, position_noise=5e-3, rate_hz=10.0)
 
 
 def rates_within(ppm: float, *sensors: str) -> Check:
-    """The rates of the `sensors` have standard deviations below `ppm`; each is named in a note; no reason is."""
+    """The rates of the `sensors` have standard deviations below `ppm`, and notes if they are clear."""
 
     def check(run: Run) -> None:
         for sensor in sensors:
             assert run.result.std(sensor, "clock_rate")[0] < ppm, run.result.std(sensor, "clock_rate")
-        assert names(run.result.notes).count("clock_rate_estimated") == len(sensors), run.result.notes
+        assert names(run.result.notes).count("clock_rate_estimated") == len(sensors) * (5.0 * ppm < RATE_PPM)
         assert not {"clock_drifts", "residuals_unexplained"} & {*names(run.result.reasons)}
 
     return check
@@ -53,7 +53,7 @@ def rates_within(ppm: float, *sensors: str) -> Check:
 CASES: dict[str, Case] = {
     "camera, LiDAR and wheels": Case(
         lambda: simulate(drifting(make_robot("3d", 20.0, "clw")), 0),
-        [known(), rates_within(30.0, "cam0", "lidar0", "wheel0")],
+        [known(), rates_within(19.0, "cam0", "lidar0", "wheel0")],
         seen=planes_found,
     ),
     "poses": Case(lambda: simulate(drifting(by_hand(POSES)), 1), [known(), rates_within(10.0, "mocap0")]),

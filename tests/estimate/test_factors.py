@@ -210,7 +210,7 @@ def with_two_clocks(setup, keyframe=5):
         for b in setup.layout.blocks
     ]
     own = ("time_offset", MIDDLE)
-    values = {k: np.repeat(v, 2) if k[1] in own else v for k, v in setup.state.values.items()}
+    values = {k: np.resize(v, 2) if k[1] in own else v for k, v in setup.state.values.items()}
     if ("board0", "tilt") in values and (in_recording("board0", 1), "tilt") not in values:
         entries.append((in_recording("board0", 1), "tilt", "tilt", 2, True))
         values[in_recording("board0", 1), "tilt"] = values["board0", "tilt"]
@@ -601,7 +601,11 @@ def with_poses(setup, starts):
     mount |= {"scale": np.array([1.03]), "clock_rate": np.array([70.0])}
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
-    values = setup.state.values | {("mocap0", k): v for k, v in mount.items()} | {("mocap0", MIDDLE): np.array([0.2])}
+    values = (
+        setup.state.values
+        | {("mocap0", k): v for k, v in mount.items()}
+        | {("mocap0", MIDDLE): np.linspace(0.2, 0.3, len(starts))}
+    )
     for k in range(1, len(starts)):
         entries += [(in_recording("board0", k), "tilt", "tilt", 2, True)]
         values[in_recording("board0", k), "tilt"] = so3.exp(rng.normal(size=3))

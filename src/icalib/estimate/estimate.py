@@ -13,11 +13,11 @@ from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import (
     Problem,
     assemble,
+    begun,
     guess_priors,
     keyframe_times,
     keyframes_for,
     resample,
-    with_further_imus,
 )
 from icalib.estimate.residual_statistics import chi2_by_kind, fits
 from icalib.estimate.solver import Outcome, SolverOptions, Step, Visit, minimise, relative_decrease
@@ -159,7 +159,7 @@ class _Passes:
         """Passes before the first one, which starts at `state`."""
         priors = () if options.guess is None else guess_priors(inputs, options.guess)
         measurement_model = options.measurement_model or MeasurementModel.first(inputs)
-        return cls(inputs, options, callbacks, with_further_imus(inputs, state), measurement_model, priors)
+        return cls(inputs, options, callbacks, begun(inputs, state), measurement_model, priors)
 
     def begin_at(self, state: State) -> None:
         """Lets the next pass start at `state`, resampled at the keyframe times that its time offsets imply."""
@@ -315,7 +315,7 @@ def first_pass(inputs: Inputs, state: State) -> State:
 
     Raises EstimationError if the data do not suffice for an estimate.
     """
-    state = with_further_imus(inputs, state)
+    state = begun(inputs, state)
     problem = MeasurementModel.first(inputs).problem(inputs, state)
     problem = _with_priors(problem, guess_priors(inputs, state, FIRST_PASS_PRIOR_WIDTH))
     return minimise(problem, state, replace(EARLY_PASS, second_order=False)).state

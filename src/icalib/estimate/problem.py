@@ -317,6 +317,20 @@ def resample(state: State, keyframes: np.ndarray, inputs: Inputs) -> State:
     )  # fmt: skip
 
 
+def begun(inputs: Inputs, state: State) -> State:
+    """The state at which passes may begin: with the states of further IMUs, and the middle of each clock."""
+    state, values = with_further_imus(inputs, state), dict(state.values)
+    bodies = [(p.begin, 1e-9 * p.shift_ns, p.measurements.imu) for p in inputs.parts]
+    moved = np.array([shift for _, shift, _ in bodies])
+    edges = np.array([(begin, begin + float(np.ptp(imu.seconds))) for begin, _, imu in bodies if imu is not None])
+    for sensor in inputs.sensors if len(edges) else ():
+        offsets = values[sensor.name, TIME_OFFSET.name]
+        recorded = edges - moved[:, None]  # a clock that does not restart drifts from one recording to the next
+        whole = 0.5 * (recorded.min() + recorded.max()) + moved
+        values[sensor.name, MIDDLE] = (edges.mean(axis=1) if len(offsets) > 1 else whole) - offsets
+    return replace(state, values=values)
+
+
 def with_further_imus(inputs: Inputs, state: State) -> State:
     """The state with the states of all IMUs after the first, at zero if it has none: rows are linear in them."""
     n = FURTHER_IMU_DIM * len(inputs.layout.further_imus)
@@ -429,18 +443,8 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
                 values[sensor.name, spec.name] = np.zeros(spec.size) if stated is None else stated.copy()
     for sensor in rig.mounted:
         if (offset := values.get((sensor.name, TIME_OFFSET.name))) is not None:
-            offsets = np.broadcast_to(offset, inputs.clocks_of(sensor))
-            values[sensor.name, TIME_OFFSET.name] = offsets
-            if inputs.imu is not None:
-                values.setdefault((sensor.name, MIDDLE), _middles(inputs, len(offsets)) - offsets)
+            values[sensor.name, TIME_OFFSET.name] = np.broadcast_to(offset, inputs.clocks_of(sensor))
     return {key: np.ascontiguousarray(v, dtype=np.float64) for key, v in values.items()}
-
-
-def _middles(inputs: Inputs, n: int) -> np.ndarray:
-    """(n,) s: middle of the recording, or of each, on the body's clock since its first stamp."""
-    bodies = [(p.begin, p.measurements.imu) for p in inputs.parts]
-    edges = np.array([(begin, begin + float(np.ptp(imu.seconds))) for begin, imu in bodies if imu is not None])
-    return edges.mean(axis=1) if n > 1 else np.array([0.5 * (edges.min() + edges.max())])
 
 
 # Gauge freedom of the world frame in a rig without a target: the first keyframe is fixed.
@@ -489,9 +493,10 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
 
 
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
-    """Priors about `guess` on all estimated parameters of sensors for which the rig file states no prior. Their
+    """Priors about `guess` on all estimated parameters of sensors which have no other prior. Their
     standard deviation is `times` that of `guess_sigma`."""
     sigma = times * guess_sigma(inputs, guess)
     given = {p.block.key for p in stated_priors(inputs)}
-    blocks = (b for b in inputs.layout.free if inputs.is_sensor(b.sensor) and b.key not in given)
+    open_blocks = (b for b in inputs.layout.free if b.key not in given and not b.is_nuisance)
+    blocks = (b for b in open_blocks if inputs.is_sensor(b.sensor))
     return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in blocks)

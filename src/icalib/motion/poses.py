@@ -423,8 +423,9 @@ def imu_poses(motion: EstimatedMotion, times: np.ndarray) -> Poses:
 #
 #     t_body = t + time_offset + clock_rate (t - t_mid)        t: sensor's time since its first stamp
 #
-# The value of time_offset is (1,) or (R,) s, that of clock_rate (1,) ppm. t_mid (1,) or (R,) is the value of the key
-# MIDDLE, which is no parameter. Without it, as in an initial guess, the rate is zero.
+# The value of time_offset is (1,) or (R,) s, that of clock_rate (1,) ppm. t_mid (R,) is the value of the key MIDDLE,
+# which is no parameter: one for each recording, since joined recordings are moved. Without it, as in an initial guess,
+# the rate is zero.
 
 MIDDLE = "middle of the clock"
 PPM = 1e-6
@@ -437,58 +438,53 @@ def instants(stream: Stream, values: Mapping[Key, np.ndarray], seconds: np.ndarr
     its stamps."""
     t = stream.seconds if seconds is None else seconds
     joins = np.array([1e-9 * (ns - stream.origin_ns) for ns in stream.joins_ns]) - RECORDING_MARGIN_S
-    restarts = len(values[stream.name, "time_offset"]) > 1
-    return t + _offsets(values, stream.name, np.searchsorted(joins, t, side="right") * restarts, t)
+    return t + _offsets(values, stream.name, np.searchsorted(joins, t, side="right"), t)
 
 
 def clock_numbers(state: State, name: str, keyframe: np.ndarray) -> np.ndarray:
     """Number (n,) of the time offset that applies to measurements at `keyframe` (n,)."""
-    if len(state.values[name, "time_offset"]) == 1:
-        return np.zeros(len(keyframe), dtype=np.int64)
-    return np.searchsorted(state.starts, keyframe, side="right") - 1
+    return _recordings(state, keyframe) * (len(state.values[name, "time_offset"]) > 1)
 
 
 def offset_at(state: State, name: str, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Time offset (n,) s, with the drift, of a sensor's measurements at `keyframe` (n,) and `seconds` (n,) on its
     clock."""
-    return _offsets(state.values, name, clock_numbers(state, name, keyframe), seconds)
+    return _offsets(state.values, name, _recordings(state, keyframe), seconds)
 
 
 def drift_at(state: State, name: str, keyframe: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Derivative (n,) of `offset_at` by the clock rate [s/ppm]."""
-    return _drift(state.values, name, clock_numbers(state, name, keyframe), seconds)
+    middle = state.values.get((name, MIDDLE))
+    return np.zeros(len(seconds)) if middle is None else PPM * (seconds - middle[_recordings(state, keyframe)])
 
 
 def seconds_at(state: State, name: str) -> np.ndarray:
     """Time (K,) s of each keyframe on the clock of a sensor, since its first stamp."""
-    clock = clock_numbers(state, name, np.arange(len(state.seconds)))
-    t = state.seconds - state.values[name, "time_offset"][clock]
-    if not _has_rate(state.values, name):
+    keyframe = np.arange(len(state.seconds))
+    t = state.seconds - state.values[name, "time_offset"][clock_numbers(state, name, keyframe)]
+    if (name, MIDDLE) not in state.values:
         return t
-    middle = state.values[name, MIDDLE][clock]
+    middle = state.values[name, MIDDLE][_recordings(state, keyframe)]
     return middle + (t - middle) / pace_of(state, name)
 
 
 def pace_of(state: State, name: str) -> float:
     """Seconds of the body's clock for one of the clock of a sensor."""
-    return 1.0 + PPM * float(state.values[name, "clock_rate"][0]) if _has_rate(state.values, name) else 1.0
+    return 1.0 + PPM * float(state.values[name, "clock_rate"][0]) if (name, MIDDLE) in state.values else 1.0
 
 
-def _offsets(values: Mapping[Key, np.ndarray], name: str, clock: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Time offsets (n,) s at `seconds` (n,) on a clock; clock (n,): number of the time offset."""
-    offset = values[name, "time_offset"][clock]
-    if not _has_rate(values, name):
+def _recordings(state: State, keyframe: np.ndarray) -> np.ndarray:
+    """Number (n,) of the recording of each keyframe (n,)."""
+    return np.searchsorted(state.starts, keyframe, side="right") - 1
+
+
+def _offsets(values: Mapping[Key, np.ndarray], name: str, recording: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Time offsets (n,) s at `seconds` (n,) on the clock of a sensor in the recordings number `recording` (n,)."""
+    of_clocks, middle = values[name, "time_offset"], values.get((name, MIDDLE))
+    offset = of_clocks[recording * (len(of_clocks) > 1)]
+    if middle is None:
         return offset
-    return offset + values[name, "clock_rate"][0] * _drift(values, name, clock, seconds)
-
-
-def _drift(values: Mapping[Key, np.ndarray], name: str, clock: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Derivative (n,) of `_offsets` by the clock rate [s/ppm]."""
-    return PPM * (seconds - values[name, MIDDLE][clock]) if _has_rate(values, name) else np.zeros(len(seconds))
-
-
-def _has_rate(values: Mapping[Key, np.ndarray], name: str) -> bool:
-    return (name, MIDDLE) in values
+    return offset + PPM * values[name, "clock_rate"][0] * (seconds - middle[recording])
 
 
 def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[tuple[int, slice]]:

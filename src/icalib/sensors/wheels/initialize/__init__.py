@@ -34,7 +34,7 @@ from icalib.motion.imu_data import ImuData, clear_of
 from icalib.motion.poses import imu_poses, instants, is_known
 from icalib.optim.state import Key, State
 from icalib.rig import Rig, Wheels
-from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION, mounted
+from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET, TRANSLATION, mounted
 from icalib.sensors.wheels.initialize.drive_guess import (
     ReversedYawError,
     WheelRates,
@@ -100,7 +100,7 @@ def wheel_values(inputs: Inputs, state: State, sensors: Sequence[Wheels]) -> dic
 def _wheels(inputs: Inputs, state: State, wheels: Wheels, stream: WheelStream | WheelPoses) -> dict[Key, np.ndarray]:
     """As `wheel_values`, for one set of wheels. Values of the rig file are kept unless the trajectory contradicts
     them."""
-    names = [spec.name for spec in wheels.specs()]
+    names = [spec.name for spec in wheels.specs() if spec != CLOCK_RATE]
     known = stated_values(inputs, wheels, names)
     if isinstance(stream, WheelPoses):
         known |= {(wheels.name, spec.name): np.ones(spec.size) for spec in wheels.drive_specs}
