@@ -11,7 +11,7 @@ import pytest
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.estimate.estimate import estimate
-from icalib.estimate.problem import Problem, assemble
+from icalib.estimate.problem import Problem, assemble, begun
 from icalib.estimate.residual_statistics import _cluster_gradients, _count, cluster_covariances
 from icalib.estimate.solver import Outcome, SolverOptions, minimise
 from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
@@ -45,6 +45,7 @@ def solved() -> tuple[Problem, Outcome]:
     scenario = replace(followers(3.0), **exact)
     rig = with_drawn_guess(rig_for(scenario, intrinsics="free", distortion="free"), scenario, 1)
     inputs, state, _ = guess_of_rig(rig, [simulate(scenario, 1).measurements])
+    state = begun(inputs, state)
     problem = assemble(inputs, state, MODEL.first_noise(rig.cameras, rig, inputs.measurements))
     return problem, minimise(problem, state, SolverOptions(1e-6))
 

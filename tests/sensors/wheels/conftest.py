@@ -216,6 +216,7 @@ def make_world(
             (s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")
             for (s, n), v in values.items()
         ]
+        + [("wheel0", "clock_rate", "vector", 1, False)]
     )
     state = State(keyframes, R, p, v, np.tile(BIAS, (len(keyframes), 1)), values)
     return World(drive, ImuData.build(stream, NOISE), seconds, drive.angles(seconds + offset), layout, state)
