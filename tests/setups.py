@@ -325,9 +325,11 @@ class RoomSetup:
         return Problem(self.layout, keyed((imu, lidar)), (), tolerance, framed=False)
 
 
-def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025, sheet: bool = False) -> RoomSetup:
+def make_room(
+    sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025, sheet: bool = False, drifts: bool = False
+) -> RoomSetup:
     """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on. sheet: the floor
-    is the sheet of a target at the origin of the world."""
+    is the sheet of a target at the origin of the world; drifts: the rate of the clock is estimated."""
     truth, stream = sim.truth, sim.measurements.lidars[0]
     imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
     count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))
@@ -341,7 +343,7 @@ def make_room(sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025
     ]
     entries.append((stream.name, "translation", "vector", 3, True))
     entries.append((stream.name, "time_offset", "vector", 1, True))
-    entries.append((stream.name, "clock_rate", "vector", 1, True))
+    entries.append((stream.name, "clock_rate", "vector", 1, drifts))
     entries.append((stream.name, "range_offset", "vector", 1, sheet))
     if sheet:
         assert used[0] == 0, "the first face of a room is its floor"

@@ -124,12 +124,10 @@ def with_further_imus(setup, number):
     entries, values = [], {}
     for k, name in enumerate(names):
         entries += [(name, "rotation", "rotation", 3, True), (name, "translation", "vector", 3, True)]
-        entries += [(name, "time_offset", "vector", 1, True), (name, "clock_rate", "vector", 1, True)]
-        entries += [(name, "intrinsics", "vector", 24, True)]
+        entries += [(name, "time_offset", "vector", 1, True), (name, "intrinsics", "vector", 24, True)]
         values |= {(name, "rotation"): so3.exp(np.array([0.1, -0.2, 0.15]) * (k + 1.0))}
         values |= {(name, "translation"): np.array([0.1, 0.05, -0.08]), (name, "time_offset"): np.array([2e-3])}
         entries += [(name, "size_effect", "vector", 6, True)]
-        values |= {(name, "clock_rate"): np.array([60.0]), (name, MIDDLE): np.array([0.1])}
         values |= {(name, "intrinsics"): np.full(24, 1e-3), (name, "size_effect"): np.arange(6) * 1e-3}
     old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     own = np.random.default_rng(3).normal(size=(len(setup.state.seconds), 9 * number)) * 0.05
@@ -386,7 +384,7 @@ def lidar_sample(
 ):
     """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
     that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target."""
-    setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet)
+    setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet, drifts=True)
     setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:
         stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))

@@ -41,7 +41,7 @@ from icalib.optim.state import FURTHER_IMU_DIM, Block, Key, Layout, State
 from icalib.rig import Parameter, Rig
 from icalib.rig.scene import FRAME as SENSOR_FRAME
 from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, WORLD
-from icalib.sensors.sensor import TIME_OFFSET, TRANSLATION
+from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET, TRANSLATION
 
 # The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (iCalib paper
 # (15)).
@@ -323,7 +323,8 @@ def begun(inputs: Inputs, state: State) -> State:
     bodies = [(p.begin, 1e-9 * p.shift_ns, p.measurements.imu) for p in inputs.parts]
     moved = np.array([shift for _, shift, _ in bodies])
     edges = np.array([(begin, begin + float(np.ptp(imu.seconds))) for begin, _, imu in bodies if imu is not None])
-    for sensor in inputs.sensors if len(edges) else ():
+    drifting = [s for s in inputs.sensors if inputs.layout.has(s.name, CLOCK_RATE.name)]
+    for sensor in drifting if len(edges) else ():
         offsets = values[sensor.name, TIME_OFFSET.name]
         recorded = edges - moved[:, None]  # a clock that does not restart drifts from one recording to the next
         whole = 0.5 * (recorded.min() + recorded.max()) + moved

@@ -499,12 +499,13 @@ def slices_by_clock(state: State, name: str, keyframe: np.ndarray) -> Iterator[t
 
 
 def pose_columns(layout: Layout, name: str, clock: int = 0) -> np.ndarray:
-    """Calibration columns (8,) of a sensor's rotation (-1 if it has none), translation, time offset number `clock` or
-    the only one, and clock rate."""
+    """Calibration columns (8,) of a sensor's rotation, translation, time offset number `clock` or the only one, and
+    clock rate. Those of a rotation or rate that it does not have are -1."""
     offset = layout.columns(name, "time_offset")
     offset_column = offset[clock if len(offset) > 1 else 0]
     rotation = layout.columns(name, "rotation") if layout.has(name, "rotation") else np.full(3, -1)
-    translation, rate = layout.columns(name, "translation"), layout.columns(name, "clock_rate")
+    translation = layout.columns(name, "translation")
+    rate = layout.columns(name, "clock_rate") if layout.has(name, "clock_rate") else np.full(1, -1)
     return np.concatenate([rotation, translation, [offset_column], rate])
 
 

@@ -48,6 +48,7 @@ def truth() -> tuple[Inputs, State]:
         ("mocap0", "rotation"): mocap.T_imu_sensor[:3, :3].copy(),
         ("mocap0", "translation"): mocap.T_imu_sensor[:3, 3].copy(),
         ("mocap0", "time_offset"): np.array([late]),
+        ("mocap0", "clock_rate"): np.zeros(1),
         (frame_of("mocap0", 0), FRAME[0]): np.eye(3),
         (frame_of("mocap0", 0), FRAME[1]): np.zeros(3),
     }

@@ -28,7 +28,7 @@ def test_defaults(tmp_path):
     rig = loaded(tmp_path)
     (sensor,) = rig.of(PositionSensor)
     assert sensor == PositionSensor("gnss0", "gnss.pos")
-    assert [spec.name for spec in sensor.specs()] == ["translation", "time_offset"]
+    assert [spec.name for spec in sensor.specs()] == ["translation", "time_offset", "clock_rate"]
 
 
 @pytest.mark.parametrize(

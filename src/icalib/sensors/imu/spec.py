@@ -20,7 +20,7 @@ from icalib.sensors.fields import (
     vector_parameter,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
-from icalib.sensors.sensor import CLOCK_RATE, MOUNTED, PLAIN_TABLE, Axes, MountedSensor, Sampling, TableLayout
+from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, MountedSensor, Sampling, TableLayout
 
 
 @dataclass(frozen=True)
@@ -152,8 +152,7 @@ BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs f
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
-_MOUNTED = (*MOUNTED, CLOCK_RATE)  # parameters of an IMU that is not the body
-_MOUNT = (*(spec.name for spec in _MOUNTED), "clock_restarts")
+_MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,6 @@ class ImuSensor(MountedSensor):
     is_inertial: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
-        CLOCK_RATE,
         ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1),
         SIZE_EFFECT,
     )
@@ -211,7 +209,7 @@ class ImuSensor(MountedSensor):
         """See `Sensor`; extrinsics and time offset only where `mounted`, the size effect only where the rig file has
         it."""
         has_size = self.size_effect.mode != "fixed" or self.size_effect.value is not None
-        specs = self.parameters if self.mounted else self.parameters[len(_MOUNTED) :]
+        specs = self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
         return specs if has_size else specs[:-1]
 
     @classmethod
@@ -224,7 +222,7 @@ class ImuSensor(MountedSensor):
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups = parameters(fields, (*_MOUNTED, SIZE_EFFECT))
+        groups = parameters(fields, (*MOUNTED, SIZE_EFFECT))
         if "intrinsics" in fields:
             groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(

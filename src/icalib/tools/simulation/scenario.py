@@ -98,7 +98,7 @@ class SimSensor(ABC):
     name: str
     T_imu_sensor: np.ndarray
     time_offset_s: float = 0.0
-    clock_rate_ppm: float = 0.0
+    clock_rate_ppm: float = field(default=0.0, kw_only=True)
     rate_hz: float = 10.0
     phase_s: float = 0.0
     clock_origin_ns: int = 0
@@ -381,7 +381,7 @@ class SimCamera:
     distortion: tuple[float, ...]
     T_imu_sensor: np.ndarray  # (4, 4)
     time_offset_s: float = 0.0
-    clock_rate_ppm: float = 0.0
+    clock_rate_ppm: float = field(default=0.0, kw_only=True)
     rate_hz: float = 20.0
     phase_s: float = 0.0
     clock_origin_ns: int = 0
