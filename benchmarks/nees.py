@@ -12,7 +12,8 @@ NEES is that of the wheels' radii and baseline.
 With --imus, rigs of two and three IMUs, from nothing, 40 s each, 30 seeds: beside a camera and a board, and alone. The
 root mean square of each error is printed, too.
 
-With --boards, a camera and a LiDAR at rest and a board in ten places, N seeds for each number of rings; and in three.
+With --boards, a camera and a LiDAR at rest and a board in ten places, N seeds for each number of rings; in three;
+and in recordings that go on while the board is carried.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ from icalib.tools.montecarlo.record import RunRecord, compare
 from icalib.tools.montecarlo.summary import Nees, Sample, nees
 from icalib.tools.simulation import Drive, Room, Scenario, handheld, load_scenario, rig_for, simulate
 from icalib.tools.simulation.motion import rotation_from_vector
-from icalib.tools.simulation.stops import Stops, simulate_stops
+from icalib.tools.simulation.stops import Pauses, Stops, simulate_stops
 
 PAPER = Path(__file__).resolve().parent.parent / "examples" / "paper"
 WALL_GRID = AprilGrid(4, 10, 0.6, 0.3)
@@ -242,7 +243,8 @@ def check_imus(seeds: range) -> int:
 def check_boards(seeds: range) -> int:
     """Prints NEES and errors of LiDARs at rest. Returns the number of checks that failed."""
     failed = 0
-    for stops in (Stops(10), Stops(10, rings=64), Stops(3)):
+    carried = (Pauses(), Pauses(sway_m=0.002), Pauses(sway_m=0.005), Pauses(late_s=0.1))
+    for stops in (Stops(10), Stops(10, rings=64), Stops(3), *(Stops(10, pauses=p) for p in carried)):
         samples, T = [], stops.T_cam_lidar
         for seed in seeds:
             result = calibrate_measurements(stops.rig(), simulate_stops(stops, seed)[0])
@@ -254,7 +256,8 @@ def check_boards(seeds: range) -> int:
             samples.append(Sample(seed, error, result.covariance[np.ix_(columns, columns)]))
         found = nees(samples, 0.99)
         turns, shifts = (np.sqrt((np.array([s.error[k] for s in samples]) ** 2).sum(axis=1).mean()) for k in PARTS)
-        print(f"{stops.n_stops} places, {stops.rings} rings: RMS {np.rad2deg(turns):.3f} deg, {1e3 * shifts:.1f} mm")
+        print(f"{stops.n_stops} places, {stops.rings} rings, {stops.pauses}")
+        print(f"  RMS {np.rad2deg(turns):.3f} deg, {1e3 * shifts:.1f} mm")
         print(f"  NEES {found.mean:.2f}, bounds {found.low:.2f} to {found.high:.2f}", flush=True)
         failed += not found.consistent
     return failed

@@ -51,6 +51,7 @@ TOLERANCE = {
     "size_effect": 1e-3,
     "distortion": 1e-2,
     "tilt": 2e-3,
+    "sheet_middle": 1e-2,
     "shape": 1e-3,
     "bloom": 0.1,
     "radii": 1e-3,

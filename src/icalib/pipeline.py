@@ -167,6 +167,8 @@ def _calibrate(
     result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
     _refuse_no_numbers(result, rig)
     lidars = [s.name for s in rig.sensors.values() if s.shows_planes]
+    if best_attempt.inputs.association.at_rest:  # of a recording that goes on between the stops only these
+        recordings = [motion.measurements for motion in best_attempt.inputs.motions]
     result = dataclasses.replace(result, pictures=tuple(pictures(result, lidars, recordings)))
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps, made=datetime.now(UTC).isoformat(timespec="seconds"))

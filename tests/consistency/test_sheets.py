@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from icalib.tools.simulation.room import Room
 FORWARDS = np.array([[0.0, 0.0, 1.0, 0.08], [0.0, -1.0, 0.0, 0.02], [1.0, 0.0, 0.0, -0.05], [0.0, 0.0, 0.0, 1.0]])
 SHEET = (0.8, 0.8)
 ROOM = Room()
+OPEN = {"room": Room(size=(200.0, 200.0, 80.0)), "range_m": (0.3, 30.0)}  # the floor alone is in reach
 MOUNTS = ("rotation", "translation", "time_offset")
 
 
@@ -46,12 +48,17 @@ def scene(seconds: float, room: Room = ROOM, sheet: tuple[float, float] | None =
 def scans() -> tuple[Simulation, np.ndarray, np.ndarray]:
     """A recording, its points in the world by the truth, and the positions that they are seen from."""
     simulation = simulate(scene(1.0), 0)
+    return simulation, *in_world(simulation)
+
+
+def in_world(simulation: Simulation) -> tuple[np.ndarray, np.ndarray]:
+    """All points in the world by the truth, and the positions that they are seen from."""
     stream, truth = simulation.measurements.lidars[0], simulation.truth
     since = (stream.stamps_ns - truth.imu_clock_origin_ns) * 1e-9 + truth.time_offset["lidar0"]
     R, p, _ = truth.pose_at(np.repeat(since, np.diff(stream.start)) + stream.offset_s)
     T = truth.T_imu_sensor["lidar0"]
     origins = p + R @ T[:3, 3]
-    return simulation, origins + np.einsum("nij,nj->ni", R @ T[:3, :3], stream.xyz), origins
+    return origins + np.einsum("nij,nj->ni", R @ T[:3, :3], stream.xyz), origins
 
 
 def true_sheet(simulation: Simulation) -> tuple[TargetSheet, np.ndarray]:
@@ -85,7 +92,8 @@ def calibrated(simulation: Simulation, seed: int, longer_m: float = 0.0, sheet=S
     (stream,) = simulation.measurements.lidars
     xyz = stream.xyz * (1.0 + longer_m / np.linalg.norm(stream.xyz, axis=1, keepdims=True))
     rig = with_drawn_guess(rig_for(simulation.scenario), simulation.scenario, seed, only=MOUNTS)
-    rig = replace(rig, target=replace(rig.target, sheet=sheet))
+    target = AprilGrid(6, 6, 0.088, 0.3, sheet=sheet, size_sigma=rig.target.size_sigma)
+    rig = replace(rig, target=target)
     unknown = replace(stream, xyz=xyz.astype(np.float32), plane=np.full_like(stream.plane, -1))
     result = calibrate_measurements(rig, simulation.measurements.with_streams(unknown))
     assert result.converged, result.status
@@ -129,7 +137,45 @@ def test_without_the_board_in_its_clouds_a_lidar_gets_the_results_of_before():
         np.testing.assert_array_equal(stated.group(g.sensor, g.name).value, g.value)
 
 
-OPEN = {"room": Room(size=(200.0, 200.0, 80.0)), "range_m": (0.3, 30.0)}  # the floor alone is in reach
+class OffCentreGrid(AprilGrid):
+    """A grid that is printed 1 cm to the left of the middle of its sheet, and 2 cm above it."""
+
+    @cached_property
+    def outlines(self) -> np.ndarray:
+        return super().outlines + [0.01, -0.02]
+
+
+def test_a_print_beside_the_middle_of_its_sheet_is_found_and_does_no_harm():
+    grid = OffCentreGrid(6, 6, 0.088, 0.3, sheet=SHEET)
+    simulation = simulate(replace(scene(8.0, azimuth_steps=300), target=grid), 1)
+    result = calibrated(simulation, 1)
+    middle = result.group("board0", "sheet_middle")
+    assert (np.abs(middle.value - [0.01, -0.02]) < 4.0 * middle.std).all() and middle.std.min() < 1e-3
+    errors, covariance = off(result, simulation)
+    check_near(errors)
+    assert errors @ np.linalg.solve(covariance, errors) < chi2.ppf(0.999, 7)
+
+
+def test_an_arm_before_an_edge_does_no_harm():
+    """It covers 8 cm of the sheet at a third of the height of one edge."""
+    simulation = simulate(scene(8.0, azimuth_steps=300, **OPEN), 3)
+    (stream,), (sheet, at) = simulation.measurements.lidars, true_sheet(simulation)
+    from_corner = (in_world(simulation)[0] - at) @ sheet.rotation - [*sheet.outline[1], 0.0]
+    covered = (stream.plane < 0) & (from_corner[:, 0] > -0.08) & (np.abs(from_corner[:, 1] + 0.4) < 0.13)
+    nearer = 1.0 - 0.2 * covered[:, None] / np.linalg.norm(stream.xyz, axis=1, keepdims=True)
+    disturbed = simulation.measurements.with_streams(replace(stream, xyz=(stream.xyz * nearer).astype(np.float32)))
+    errors, covariance = off(calibrated(replace(simulation, measurements=disturbed), 3), simulation)
+    check_near(errors)
+    assert errors @ np.linalg.solve(covariance, errors) < chi2.ppf(0.999, 7)
+
+
+@pytest.mark.parametrize(("stated", "sentence"), [((0.9, 0.9), "farther in"), ((0.7, 0.7), "farther out")])
+def test_a_wrong_size_of_the_sheet_is_named(stated, sentence):
+    simulation = simulate(scene(6.0, azimuth_steps=300), 2)
+    result = calibrated(simulation, 2, sheet=stated)
+    assert sentence in named("sheet_size_wrong", result.warnings)
+    errors, covariance = off(result, simulation)
+    assert errors @ np.linalg.solve(covariance, errors) < chi2.ppf(0.999, 7)
 
 
 @pytest.mark.full

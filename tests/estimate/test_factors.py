@@ -11,7 +11,7 @@ import importlib
 import inspect
 import pkgutil
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -37,6 +37,7 @@ from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bi
 from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import State, in_recording, make_layout
 from icalib.rig import Ground, Lidar, Loss, Scheme
+from icalib.rig.scene import SHEET_MIDDLE, TILT
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
@@ -687,29 +688,56 @@ def board_sample(kind, loss: Loss = "none", curved=False):
     target = Scene(("wall", "floor"), (Checkerboard(4, 5, 0.1, sheet=(0.8, 0.9)), AprilGrid(2, 2, 0.1, 0.3)))
     bodies = Bodies(target, (0, 1))
     entries = [spec.entry("lidar0", spec.name != "time_offset") for spec in Lidar.parameters]
-    layout = make_layout([*entries, *bodies.pose_entries()])
-    values = {
+    layout = make_layout([*entries, TILT.entry("board0", False), *bodies.pose_entries()])
+    values = {("wall", "sheet_middle"): np.zeros(2)} | {
         (b.sensor, b.name): so3.exp(rng.normal(size=3)) if b.kind == "rotation" else 0.1 * rng.normal(size=b.size)
         for b in layout.blocks
     }
+    values["board0", "tilt"] = np.eye(3)
     rotation = np.array([so3.exp(v) for v in rng.normal(size=(4, 3))])
     still = np.zeros((4, 3)), np.zeros((4, 6)), values
     state = State(np.arange(4.0), rotation, rng.normal(size=(4, 3)), *still)
     keyframe, normal = np.repeat(np.sort(rng.integers(0, 4, n // 2)), 2), rng.normal(size=(n, 3))
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     points = BoardPoints(
-        keyframe.astype(float), 3.0 * rng.normal(size=(n, 3)), keyframe, rng.integers(0, 2, n), normal,
+        keyframe.astype(float), 3.0 * rng.normal(size=(n, 3)), keyframe, keyframe, rng.integers(0, 2, n), normal,
         rng.normal(size=n), np.ones(n),
     )  # fmt: skip
     noise, sigma = LidarNoise(1.0, 0.0, loss, LOSS_SCALE), rng.uniform(0.5, 2.0, n if kind == ON_BOARDS else n // 2)
     made = BoardFactor("lidar0", kind, points, sigma, noise, bodies, (0,), 4, layout)
-    # without grazing beams, whose residuals bend within a step
-    steep = np.abs(made.rows_of_points(slice(None), state, False)[1]) > 0.4
-    steep = np.repeat(steep.reshape(len(sigma), -1).all(axis=1), made.points_per_row)
-    points = BoardPoints(*(getattr(points, f.name)[steep] for f in fields(points)))
-    made = replace(made, points=points, sigma=sigma[steep[:: made.points_per_row]])
     setup = SimpleNamespace(layout=layout, columns_scale=lambda: np.full(layout.size, 1e-2))
-    return row_sample(setup, state, made, loss if curved else "none", curved)
+    return row_sample(setup, state, steep_only(made, state), loss if curved else "none", curved)
+
+
+def steep_only(made, state):
+    """The factor without grazing beams, whose residuals bend within a step."""
+    steep = np.abs(made.rows_of_points(slice(None), state, False)[1]) > 0.4
+    steep = np.repeat(steep.reshape(len(made.sigma), -1).all(axis=1), made.points_per_row)
+    return replace(made, points=made.points.some(steep), sigma=made.sigma[steep[:: made.points_per_row]])
+
+
+def moving_board_sample(unlike, setup_of):
+    """Rings that cross the edges of a sheet in two recordings, each end at its own instant, up to 30 ms from the
+    keyframe that both ends share."""
+    setup, rng, n = setup_of(unlike, imu_free=True), np.random.default_rng(11), 80
+    old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
+    layout = make_layout([*old, *(spec.entry("lidar0") for spec in Lidar.parameters), SHEET_MIDDLE.entry("board0")])
+    more = {b.key: 0.1 * rng.normal(size=b.size) for b in layout.blocks if b.key not in setup.state.values}
+    more["lidar0", "rotation"] = so3.exp(rng.normal(size=3))
+    setup = replace(setup, layout=layout, state=replace(setup.state, values=setup.state.values | more))
+    setup = with_two_clocks(setup)
+    layout, state = setup.layout, setup.perturbed(rng, 0.02)
+    keyframe = np.repeat(np.sort(rng.integers(1, len(state.seconds) - 1, n // 2)), 2)
+    seconds = state.seconds[keyframe] - offset_at(state, "lidar0", keyframe) + rng.uniform(-0.03, 0.03, n)
+    normal = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.0]
+    points = BoardPoints(
+        seconds, 3.0 * rng.normal(size=(n, 3)), keyframe, keyframe, np.zeros(n, dtype=int), normal, rng.normal(size=n),
+        np.ones(n),
+    )  # fmt: skip
+    bodies, sigma = Bodies(Checkerboard(4, 5, 0.1, sheet=(0.8, 0.9)), (0,)), rng.uniform(0.5, 2.0, n // 2)
+    noise, count = LidarNoise(1.0, 0.0, "none", LOSS_SCALE), len(state.seconds)
+    made = BoardFactor("lidar0", ON_EDGES, points, sigma, noise, bodies, state.starts, count, layout, setup.imu, 9.81)
+    return row_sample(setup, state, steep_only(made, state), "none", False)
 
 
 def patch_sample(loss: Loss = "none", curved=False):
@@ -813,6 +841,7 @@ SAMPLES = {
         lambda u, s, f: lidar_sample(*s, beam=0.02, noisy=30.0, sheet=True),
     ),
     "points on boards": ("BoardFactor", lambda u, s, f: board_sample(ON_BOARDS)),
+    "edges of boards in motion": ("BoardFactor", lambda u, s, f: moving_board_sample(u, s)),
     "edges of boards, huber, curved": ("BoardFactor", lambda u, s, f: board_sample(ON_EDGES, "huber", True)),
     "prior on a rotation": ("Prior", lambda u, s, f: prior_sample(u, s, "cam1", "rotation")),
     "prior on a vector": ("Prior", lambda u, s, f: prior_sample(u, s, "cam0", "intrinsics")),

@@ -261,9 +261,8 @@ def _simulate(options: argparse.Namespace) -> None:
     from icalib.tools.simulation.writing import check_absent
 
     if (stops := load_stops(options.scenario)) is not None:
-        if options.level != "data":
-            raise CalibrationError("rigs at rest are simulated as tables; leave --level out.")
-        write_stops(stops, stops.seed if options.seed is None else options.seed, options.output)
+        seed = stops.seed if options.seed is None else options.seed
+        write_stops(stops, seed, options.output, as_bag=options.level == "sensor")
         return
     scenario = load_scenario(options.scenario)
     seed = scenario.seed if options.seed is None else options.seed

@@ -325,5 +325,6 @@ def pass_names(inputs: Inputs) -> tuple[str, ...]:
     """Names of the passes in order. Between the first and the final pass there are up to two that estimate noise and
     inliers, as many as the sensors need."""
     kinds = by_kind(inputs.sensors)
-    count = max((model.passes(sensors, inputs.rig, inputs.measurements) for model, sensors in kinds), default=0)
+    of = inputs.rig, inputs.measurements, inputs.association
+    count = max((model.passes(sensors, *of) for model, sensors in kinds), default=0)
     return ("first", *("noise", "noise again")[:count], "final")

@@ -18,7 +18,7 @@ from icalib.motion.imu_data import ImuData, joined_imu_data
 from icalib.motion.point_planes import NO_ASSOCIATION, PlaneAssociation
 from icalib.optim.state import Block, Entry, Key, Layout, State, in_recording, make_layout
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor, Settings
-from icalib.rig.scene import GRAVITY, SCENE, TILT, WORLD
+from icalib.rig.scene import GRAVITY, SCENE, SHEET_MIDDLE, TILT, WORLD
 from icalib.sensors.sensor import TIME_OFFSET
 
 
@@ -127,6 +127,7 @@ def layout_for(
     for k in range(1 if imu is None else n_recordings) if bodies.used else ():
         entries.append(TILT.entry(in_recording(BOARD, k), levelled))
     entries += bodies.size_entries() + bodies.shape_entries()
+    entries += [SHEET_MIDDLE.entry(bodies.names[0])] if association.sheets else []
     for sensor in sensors:
         entries += own_entries(sensor, rig, n_recordings, association)
     for sensor in sensors:

@@ -40,7 +40,7 @@ from icalib.optim.arrowhead import (
 from icalib.optim.state import FURTHER_IMU_DIM, Block, Key, Layout, State
 from icalib.rig import Parameter, Rig
 from icalib.rig.scene import FRAME as SENSOR_FRAME
-from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, WORLD
+from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, SHEET_MIDDLE, WORLD
 from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET, TRANSLATION
 
 # The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (iCalib paper
@@ -240,6 +240,8 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     ]
     for block in layout.free:
         stated, spec = inputs.stated(block), inputs.specs[block.key]
+        if block.name == SHEET_MIDDLE.name:
+            priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
         if stated is not None and spec.is_auxiliary and stated.mode == "free":
             priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
     return (*priors, *stated_priors(inputs))
@@ -437,6 +439,7 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
         values[name, "shape"] = np.zeros(len(SHAPE_LABELS))
     for reference in inputs.bodies.names[:1]:
         values[reference, "rotation"], values[reference, "translation"] = np.eye(3), np.zeros(3)
+        values[reference, SHEET_MIDDLE.name] = np.zeros(2)
     for sensor in rig.sensors.values():
         for spec in sensor.specs():
             if spec.manifold == "nuisance" or spec.is_auxiliary:  # the guess has no bias, scale or shape

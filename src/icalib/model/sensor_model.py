@@ -107,7 +107,7 @@ class SensorModel(Generic[S, N]):
         """Noise of each sensor, estimated after a pass with `noise`. Stated parts are unchanged."""
         return {s.name: noise[s.name] for s in sensors}
 
-    def passes(self, sensors: Sequence[S], rig: Rig, measurements: Measurements) -> int:
+    def passes(self, sensors: Sequence[S], rig: Rig, measurements: Measurements, association: PlaneAssociation) -> int:
         """Number of passes that the estimates of noise and inliers need; 0 if all noise is stated."""
         return 0
 

@@ -31,6 +31,19 @@ SHAPE = ParameterSpec(
     by_images=True,
     motion="show the target from more sides and closer",
 )
+# The middle of a target's sheet from the middle of its points, in the frame of its body. Prior: the example of
+# cam_lidar_calibration (Tsai et al. 2021) has 10 and 30 mm. With twice as much the edges of a sheet add less.
+SHEET_MIDDLE = ParameterSpec(
+    name="sheet_middle",
+    size=2,
+    manifold="vector",
+    unit="m",
+    labels=AXES[:2],
+    tolerance=1e-2,
+    prior_sigma=1e-2,
+    is_auxiliary=True,
+    meaning="how far the middle of the target's sheet is from that of its print",
+)
 # Scene parameters have a wide prior sigma, as users give no guess of the vertical, walls or frames. An unobservable
 # direction that moves a sensor and the scene together thus has the prior uncertainty of the sensor.
 TILT = ParameterSpec(
@@ -59,4 +72,4 @@ FRAME_OFFSET = ParameterSpec("frame_offset", 3, "vector", "m", AXES, 0.5, 10.0)
 FRAME = (FRAME_ROTATION, FRAME_TRANSLATION)  # pose of a pose sensor's static frame in the world frame
 LEVEL_FRAME = (FRAME_YAW, FRAME_TRANSLATION)  # the same for a frame whose z axis is vertical, as that of the world
 BODY = (ROTATION, TRANSLATION)  # pose of a body, if the target has several
-SCENE = (SIZE, GRAVITY, TILT, SHAPE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)
+SCENE = (SIZE, GRAVITY, TILT, SHAPE, SHEET_MIDDLE, PLANE, FRAME_YAW, FRAME_OFFSET, *FRAME, *BODY)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,10 @@ from icalib.cli import main
 from icalib.data.recordings import open_recording, read_measurements
 from icalib.errors import RigError
 from icalib.rig.file import load_rig
-from icalib.tools.simulation.stops import load_stops, simulate_stops
+from icalib.tools.simulation.stops import ONCE, Pauses, load_stops, simulate_stops
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "stops" / "camera-lidar.yaml"
+CARRIED = EXAMPLE.with_name("carried-board.yaml")
 
 
 def test_a_scenario_of_stops_is_written_and_read_back(tmp_path):
@@ -56,6 +58,34 @@ def test_bad_scenarios_of_stops_are_refused(case, tmp_path):
         load_stops(tmp_path / "scenario.yaml")
 
 
-def test_stops_are_no_bag(tmp_path, capsys):
+def test_stops_alone_are_no_bag(tmp_path, capsys):
     assert main(["simulate", str(EXAMPLE), "-o", str(tmp_path / "run"), "--level", "sensor"]) == 1
-    assert "rigs at rest are simulated as tables; leave --level out." in capsys.readouterr().err
+    assert "a bag of stops needs `hold` in the section stops; give it, or leave --level out." in capsys.readouterr().err
+
+
+def test_a_recording_rests_at_the_places_and_moves_between():
+    places = np.tile(np.eye(4), (3, 1, 1))
+    places[:, 0, 3] = 0.0, 1.0, 3.0
+    places[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])
+    pauses = Pauses(hold_s=2.0, carry_s=1.0, camera_hz=10.0)
+    seconds = pauses.instants(3, 10.0)
+    poses = pauses.poses(places, seconds)
+    assert len(seconds) == 80  # three holds and two ways
+    rest = seconds % 3.0 < 2.0
+    np.testing.assert_allclose(poses[rest], places[(seconds[rest] // 3.0).astype(int)], atol=1e-12)
+    middle = pauses.poses(places, np.array([2.5, 5.5]))
+    np.testing.assert_allclose(middle[:, 0, 3], [0.5, 2.0])
+    assert np.trace(middle[0, :3, :3]) == pytest.approx(1.0)  # half of half a turn
+    sway = replace(pauses, sway_m=0.01).poses(places, seconds)[:, :3, 3] - poses[:, :3, 3]
+    np.testing.assert_allclose(np.abs(sway).max(axis=0), 0.01, rtol=0.05)
+
+
+def test_scenarios_give_the_times_and_the_offset_of_clocks(tmp_path):
+    stops = load_stops(CARRIED)
+    assert stops is not None
+    assert stops.pauses == Pauses(2.0, 1.5, camera_hz=10.0, lidar_hz=10.0, scan_s=0.1, late_s=0.03, sway_m=0.001)
+    measured, _ = simulate_stops(replace(stops, n_stops=2, azimuth_steps=90), 1)
+    lidar = measured.lidars[0]
+    assert lidar.stamps_ns[0] - measured.cameras[0].stamps_ns[0] == 30_000_000
+    assert 0.09 < lidar.offset_s.max() < 0.1
+    assert load_stops(EXAMPLE).pauses == ONCE  # pyright: ignore[reportOptionalMemberAccess]

@@ -116,7 +116,9 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
                 next_noise[camera.name] = replace(next_noise[camera.name], model=model, corners=corners)
         return next_noise
 
-    def passes(self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements) -> int:
+    def passes(
+        self, sensors: Sequence[Camera], rig: Rig, measurements: Measurements, association: PlaneAssociation
+    ) -> int:
         """Passes needed to estimate noise and inliers: two with common errors of an image, else one, or zero.
 
         Outliers of tracks need a pass even if all noise is stated, because they show only once the lens is known."""

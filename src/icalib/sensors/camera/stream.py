@@ -71,6 +71,12 @@ class CornerStream(_ImageStream):
             self.name, stamps_ns, start, point, uv, sigma=sigma, edges=edges, jitter_s=self.jitter_s, **of_images
         )
 
+    def by_point(self) -> np.ndarray:
+        """(M, P, 2) float32: where each image shows each point, NaN where it does not."""
+        uv = np.full((len(self.stamps_ns), int(self.point.max(initial=0)) + 1, 2), np.nan, np.float32)
+        uv[self.image, self.point] = self.uv
+        return uv
+
     @classmethod
     def joined(cls, streams: Sequence[Any], shifts_ns: Sequence[int] | None = None) -> Self:
         parts = zip(streams, shifts_ns or [0] * len(streams), strict=True)

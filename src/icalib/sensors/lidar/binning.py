@@ -55,6 +55,11 @@ class LidarNoise:
     inflation: float = 1.0
     flatness: float = 0.02  # walls and roads within a metre or two
 
+    @property
+    def along(self) -> float:
+        """Standard deviation of a point along its beam [m]."""
+        return float(np.hypot(self.sigma, self.beam_sigma))
+
 
 @dataclass(frozen=True)
 class AssociatedPoints:

@@ -73,10 +73,12 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
             next_noise[factor.name] = replace(factor.noise, flatness=factor.measured_flatness(end.state))
         return next_noise
 
-    def passes(self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements) -> int:
+    def passes(
+        self, sensors: Sequence[Lidar], rig: Rig, measurements: Measurements, association: PlaneAssociation
+    ) -> int:
         if rig.imu is None:
             return 2  # the first estimate of errors that points share is rough
-        return int(any(s.range_noise_m is None for s in sensors))
+        return int(any(s.range_noise_m is None for s in sensors) or bool(association.sheets))
 
     def factors(self, sensor: Lidar, stream: LidarStream, noise: LidarNoise, at: Pass) -> Iterator[Factor]:
         """One factor for all points on planes, at rest for those on the target. Coarse passes use fewer points and
@@ -88,6 +90,8 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
         yield LidarFactor.build(stream, used, at.association.surfaces, at.motion, noise, at.layout, scheme, bin_s)
+        if at.association.sheets and not at.coarse:
+            yield from BoardFactor.build(stream, noise, at)
 
     def joint_factors(
         self, sensors: Sequence[Lidar], factors: Sequence[Factor], noise: Mapping[str, LidarNoise], at: Pass

@@ -73,6 +73,8 @@ class PatchPoints:
         scans = [_scan_at_keyframes(stream, state) for stream in streams.values()]
         for k in range(len(state.seconds)):
             clouds = [_cloud(stream, scan[k]) for stream, scan in zip(streams.values(), scans, strict=True)]
+            if not any(map(len, clouds)):  # the second keyframe of a single stop
+                continue
             of_lidar = np.repeat(np.arange(len(names)), [len(cloud) for cloud in clouds])
             points = cls(of_lidar, of_lidar, np.concatenate(clouds), np.full(1, k))
             number = shared_patches(StopCloud(*points.in_body(names, state), of_lidar), noise_m, gate_m)

@@ -9,6 +9,7 @@ import numpy as np
 
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel, frame_entries
+from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import instants, spaced
 from icalib.optim.state import Entry, Key
 from icalib.rig import ImuSensor, PoseSensor, Rig
@@ -61,7 +62,9 @@ class PoseModel(SensorModel[PoseSensor, PoseNoise]):
         factors = {s.name: end.of(s.name).variance_factors() if is_estimated(s) else {} for s in sensors}
         return {s.name: estimated_noise(s, noise[s.name], factors[s.name]) for s in sensors}
 
-    def passes(self, sensors: Sequence[PoseSensor], rig: Rig, measurements: Measurements) -> int:
+    def passes(
+        self, sensors: Sequence[PoseSensor], rig: Rig, measurements: Measurements, association: PlaneAssociation
+    ) -> int:
         return 2 * any(is_estimated(s) for s in sensors)
 
     def factors(self, sensor: PoseSensor, stream: PoseStream, noise: PoseNoise, at: Pass) -> Iterator[PoseFactor]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from icalib.data.measurements import Measurements
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel, frame_entries
+from icalib.motion.point_planes import PlaneAssociation
 from icalib.optim.state import Entry, Key
 from icalib.rig import Rig
 from icalib.rig.scene import FRAME, LEVEL_FRAME
@@ -64,7 +65,9 @@ class PositionModel(SensorModel[PositionSensor, PositionNoise]):
             next_noise[name] = replace(now, horizontal=horizontal, vertical=vertical)
         return next_noise
 
-    def passes(self, sensors: Sequence[PositionSensor], rig: Rig, measurements: Measurements) -> int:
+    def passes(
+        self, sensors: Sequence[PositionSensor], rig: Rig, measurements: Measurements, association: PlaneAssociation
+    ) -> int:
         return 2 * any(s.position_noise is None for s in sensors)
 
     def factors(

@@ -151,7 +151,7 @@ class GivenTarget:
 @dataclass(frozen=True)
 class Inspection:
     """Result of `inspect_recording`. facts: by name of the sensor, a dataclass of its kind, or None. imu: the IMU to
-    calibrate with; None without a readable one."""
+    calibrate with; None without a readable one. rest: what to say of a rig that stops, in place of its motion."""
 
     recording: str
     sources: Sources
@@ -163,6 +163,7 @@ class Inspection:
     frames: tuple[FramePair, ...] = ()
     notes: tuple[str, ...] = ()
     findings: tuple[Finding, ...] = ()
+    rest: Finding | None = None
 
     @property
     def verdict(self) -> Literal["yes", "yes, but", "no"]:
@@ -510,6 +511,8 @@ def missing_sensors(inspection: Inspection) -> Iterator[Finding]:
     topic_list = listing([s.topic for s in inspection.streams])
     if inertial(inspection):
         yield from _beside_an_imu(inspection, topic_list)
+    elif inspection.rest is not None:
+        yield inspection.rest
     elif independent(inspection):
         yield _independent_without_imu(inspection, topic_list)
     elif at_stops(inspection):

@@ -13,9 +13,8 @@ import numpy as np
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.rig import Lidar, Rig, by_name
 from icalib.tools.simulation.motion import rotation_from_vector
-from icalib.tools.simulation.stops import directions
+from icalib.tools.simulation.stops import ONCE, Pauses, directions, nanoseconds, scans
 
-_STOP_NS = 1_000_000_000  # between stops
 Box = tuple[tuple[float, float, float], tuple[float, float, float], float]  # centre, size [m], yaw [deg]
 
 
@@ -62,6 +61,7 @@ class Surroundings:
     azimuth_steps: int = 900
     elevation_deg: tuple[float, float] = (-25.0, 15.0)
     range_noise_m: float = 0.02
+    pauses: Pauses = ONCE
 
     def rig(self) -> Rig:
         """The rig that a user would write, without any true value."""
@@ -75,30 +75,37 @@ def simulate_surroundings(scene: Surroundings, seed: int) -> Measurements:
     for _ in range(scene.n_stops):
         x, y = np.array(scene.places) * rng.uniform(-1.0, 1.0, 2)
         bodies.append(pose((0.0, 0.0, rng.uniform(-180.0, 180.0)), (x, y, scene.height_m)))
-    streams, stamps_ns = [], _STOP_NS * np.arange(1, scene.n_stops + 1)
-    for name, T in scene.T_lidar0.items():
-        clouds = [_cloud(scene, body @ T, rng) for body in bodies]
-        xyz = np.concatenate(clouds).astype(np.float32)
-        start = np.cumsum([0, *map(len, clouds)]).astype(np.int64)
-        zeros, none = np.zeros(len(xyz), np.float32), np.full(len(xyz), -1, np.int32)
-        streams.append(LidarStream(name, stamps_ns, start, zeros, xyz, none))
-    return Measurements.of_streams(*streams)
+    return Measurements.of_streams(*(_stream(scene, k, np.array(bodies), rng) for k in range(len(scene.T_lidar0))))
 
 
-def _cloud(scene: Surroundings, T_world_lidar: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(N, 3) measured points in the frame of the LiDAR, of the beams that hit something within 100 m."""
+def _stream(scene: Surroundings, number: int, bodies: np.ndarray, rng: np.random.Generator) -> LidarStream:
+    """The clouds of a LiDAR at `bodies` (n_stops, 4, 4) and on the way between them, each column at its instant."""
+    name, T = list(scene.T_lidar0.items())[number]
+    begins = scene.pauses.instants(scene.n_stops, scene.pauses.lidar_hz)
+    column_s = np.arange(scene.azimuth_steps) * (scene.pauses.scan_s / scene.azimuth_steps)
+    drawn = [_cloud(scene, scene.pauses.poses(bodies, t + column_s) @ T, rng) for t in begins]
+    offset_s = column_s[np.concatenate([column for _, column in drawn])]
+    stamps_ns = nanoseconds(begins + number * scene.pauses.late_s)
+    return scans(name, stamps_ns, [cloud for cloud, _ in drawn], offset_s)
+
+
+def _cloud(scene: Surroundings, T_world_lidar: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) measured points in the frame of the LiDAR, of the beams that hit something within 100 m, and their columns
+    (N,). T_world_lidar (azimuth_steps, 4, 4): at the instant of each column of beams."""
     azimuth = 2.0 * np.pi * np.arange(scene.azimuth_steps)[:, None] / scene.azimuth_steps
     beams = directions(azimuth, np.deg2rad(np.linspace(*scene.elevation_deg, scene.rings)))
-    rays, origin = beams @ T_world_lidar[:3, :3].T, T_world_lidar[:3, 3]
+    column = np.repeat(np.arange(scene.azimuth_steps), scene.rings)
+    T = T_world_lidar[column]
+    rays, origin = (T[:, :3, :3] @ beams[:, :, None])[:, :, 0], T[:, :3, 3]
     distance = np.min([_to_box(box, origin, rays) for box in scene.boxes], axis=0)
     hit = distance < 100.0
     measured = distance[hit] + scene.range_noise_m * rng.standard_normal(int(hit.sum()))
-    return beams[hit] * measured[:, None]
+    return beams[hit] * measured[:, None], column[hit]
 
 
 def _to_box(box: Box, origin: np.ndarray, rays: np.ndarray) -> np.ndarray:
-    """(n,) distances from `origin` (3,) along `rays` (n, 3) to the next side of a box, from outside or inside; infinite
-    where they miss it."""
+    """(n,) distances from `origin` (n, 3) along `rays` (n, 3) to the next side of a box, from outside or inside;
+    infinite where they miss it."""
     centre, size, yaw = box
     R = pose((0.0, 0.0, yaw), (0.0, 0.0, 0.0))[:3, :3]
     o, d = (origin - centre) @ R, rays @ R

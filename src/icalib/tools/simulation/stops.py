@@ -6,27 +6,37 @@ obvious ones, by rays and planes in the frame of the camera; none is the estimat
 
 from __future__ import annotations
 
+import heapq
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation, Slerp
 
 from icalib.base.files import below, write_text
 from icalib.base.yaml_nodes import YamlValue, read_yaml
 from icalib.data.measurements import CornerStream, LidarStream, Measurements
+from icalib.errors import RigError
 from icalib.geometry.targets import Checkerboard, Target
 from icalib.kinds import simulated_kinds
 from icalib.rig import Camera, Lidar, Parameter, Rig, Settings, by_name
 from icalib.rig.file import rig_to_dict, target_of
 from icalib.tools.simulation.motion import rotation_from_vector
+from icalib.tools.simulation.output import IMAGE, BagWriter
 from icalib.tools.simulation.projection import project, visible
+from icalib.tools.simulation.rendering import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera, interval
 from icalib.tools.simulation.scenario_file import read_camera
 from icalib.tools.simulation.writing import atomic_output, write_corners
 
 _STOP_NS = 1_000_000_000  # between stops
+_SWAY_HZ = np.array([0.31, 0.47, 0.72, 0.39, 0.58, 0.87])  # of a hand that holds a board; about and along three axes
+_SWAY_ARM_M = 0.3
+_IMAGES = "/cam0/image_raw"
 # From LiDAR axes (x ahead, y left) to those of a camera that looks ahead (x right, y down), a little askew.
 _AXES = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
@@ -41,6 +51,42 @@ def _t_cam_lidar() -> np.ndarray:
 def _camera() -> SimCamera:
     fisheye = (-0.05, -0.08, 0.1, -0.05)
     return SimCamera("cam0", "pinhole-equidistant", (1920, 1208), (1177.0, 1178.0, 962.0, 613.0), fisheye, np.eye(4))
+
+
+@dataclass(frozen=True)
+class Pauses:
+    """When what is recorded at places, in turn. hold_s: at rest at each place; carry_s: from a place to the next,
+    smoothly. camera_hz, lidar_hz: rates; scan_s: from the first to the last column of a cloud; late_s: the LiDAR's
+    stamps are late, or those of each LiDAR against the one before. sway_m: of a hand, all the time; it turns by as much
+    at 0.3 m."""
+
+    hold_s: float = 2.0
+    carry_s: float = 1.5
+    camera_hz: float = 20.0
+    lidar_hz: float = 10.0
+    scan_s: float = 0.1
+    late_s: float = 0.03
+    sway_m: float = 0.0
+
+    def instants(self, places: int, rate_hz: float) -> np.ndarray:
+        """Instants [s] of a sensor of `rate_hz` in a recording of so many places."""
+        return np.arange(0.5 / rate_hz, places * self.hold_s + (places - 1) * self.carry_s, 1.0 / rate_hz)
+
+    def poses(self, places: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+        """(n, 4, 4) poses at `seconds` (n,) of what is carried to one of `places` (p, 4, 4) after the other."""
+        place, since = np.divmod(seconds, self.hold_s + self.carry_s)
+        u = np.clip((since - self.hold_s) / self.carry_s, 0.0, 1.0)
+        along = place + u**3 * (10.0 - 15.0 * u + 6.0 * u**2)
+        places = np.concatenate([places, places[-1:]])  # the last one lasts
+        out, k = np.tile(np.eye(4), (len(seconds), 1, 1)), np.arange(len(places))
+        turns = Slerp(k, Rotation.from_matrix(places[:, :3, :3]))(along)
+        sway = self.sway_m * np.sin(2.0 * np.pi * _SWAY_HZ * seconds[:, None] + np.arange(6.0))
+        out[:, :3, :3] = (turns * Rotation.from_rotvec(sway[:, :3] / _SWAY_ARM_M)).as_matrix()
+        out[:, :3, 3] = np.stack([np.interp(along, k, places[:, i, 3]) for i in range(3)], axis=1) + sway[:, 3:]
+        return out
+
+
+ONCE = Pauses(1.0, 1e-9, camera_hz=1.0, lidar_hz=1.0, scan_s=0.0, late_s=0.0)  # an image and a cloud at each place
 
 
 @dataclass(frozen=True)
@@ -68,29 +114,46 @@ class Stops:
     room_m: float = 5.0
     panels: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
     carried: np.ndarray = field(default_factory=lambda: np.zeros((0, 4, 4)))
+    pauses: Pauses = ONCE
 
-    def rig(self, knows_lens: bool = True) -> Rig:
-        """The rig that a user would write, without any true value but, if `knows_lens`, those of the lens."""
+    def rig(self, knows_lens: bool = True, topics: bool = False) -> Rig:
+        """The rig that a user would write, without any true value but, if `knows_lens`, those of the lens. topics: of a
+        bag in place of files."""
         c, sheet = self.camera, replace(self.target, size_sigma=0.0)
         lens = [Parameter("fixed", np.array(x)) if knows_lens else Parameter() for x in (c.intrinsics, c.distortion)]
         camera = Camera(c.name, f"{c.name}/corners.csv", c.model, c.resolution, c.corner_noise_px, lens[0], lens[1])
+        lidar = Lidar("lidar0", "lidar0/scans.npz", self.range_noise_m)
+        if topics:
+            camera, lidar = replace(camera, path="", topic=_IMAGES), replace(lidar, path="", topic="/lidar0/points")
         settings = Settings(loss="none", outlier_std=0.0, bloom=False, board_shape=False, blur_noise=False, segments=0)
-        return Rig(by_name(camera, Lidar("lidar0", "lidar0/scans.npz", self.range_noise_m)), sheet, settings=settings)
+        return Rig(by_name(camera, lidar), sheet, settings=settings)
 
 
 def simulate_stops(stops: Stops, seed: int) -> tuple[Measurements, np.ndarray]:
     """Corners and clouds of all stops, and the poses T_cam_board (n_stops, 4, 4) of the board."""
     rng = np.random.default_rng(seed)
     boards = np.array([_board_pose(stops, rng) for _ in range(stops.n_stops)])
-    stamps_ns = _STOP_NS * np.arange(1, stops.n_stops + 1)
-    corners, points = zip(*(_corners(stops, T, rng) for T in boards), strict=True)
-    clouds = [_cloud(stops, T, rng) for T in boards]
-    starts = [np.cumsum([0, *(len(x) for x in each)]).astype(np.int64) for each in (corners, clouds)]
-    camera = CornerStream(stops.camera.name, stamps_ns, starts[0], np.concatenate(points), np.concatenate(corners))
+    pauses, n = stops.pauses, stops.n_stops
+    at_images, at_clouds = pauses.instants(n, pauses.camera_hz), pauses.instants(n, pauses.lidar_hz)
+    corners, points = zip(*(_corners(stops, T, rng) for T in pauses.poses(boards, at_images)), strict=True)
+    clouds = [_cloud(stops, T, rng) for T in pauses.poses(boards, at_clouds)]
+    start = np.cumsum([0, *(len(x) for x in corners)]).astype(np.int64)
+    images = nanoseconds(at_images), start, np.concatenate(points), np.concatenate(corners)
+    column_s = np.arange(len(clouds[0])) // stops.rings * (pauses.scan_s / stops.azimuth_steps)
+    lidar = scans("lidar0", nanoseconds(at_clouds + pauses.late_s), clouds, np.tile(column_s, len(clouds)))
+    return Measurements.of_streams(CornerStream(stops.camera.name, *images), lidar), boards
+
+
+def nanoseconds(seconds: np.ndarray) -> np.ndarray:
+    """Stamps [ns] of instants (n,) of a recording."""
+    return _STOP_NS + np.round(1e9 * seconds).astype(np.int64)
+
+
+def scans(name: str, stamps_ns: np.ndarray, clouds: Sequence[np.ndarray], offset_s: np.ndarray) -> LidarStream:
+    """The stream of clouds (N, 3). offset_s: of all points from the stamps of their clouds."""
     xyz = np.concatenate(clouds).astype(np.float32)
-    zeros, none = np.zeros(len(xyz), np.float32), np.full(len(xyz), -1, np.int32)
-    lidar = LidarStream("lidar0", stamps_ns, starts[1], zeros, xyz, none)
-    return Measurements.of_streams(camera, lidar), boards
+    start = np.cumsum([0, *map(len, clouds)]).astype(np.int64)
+    return LidarStream(name, stamps_ns, start, offset_s.astype(np.float32), xyz, np.full(len(xyz), -1, np.int32))
 
 
 def _board_pose(stops: Stops, rng: np.random.Generator) -> np.ndarray:
@@ -117,9 +180,12 @@ def _between(angle: np.ndarray, limits_deg: tuple[float, float]) -> np.ndarray:
 
 
 def _corners(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Noisy image points (n, 2) of all corners, and their numbers (n,)."""
-    uv = project(stops.camera, stops.target.points @ T_cam_board[:3, :3].T + T_cam_board[:3, 3])
-    return uv + stops.camera.corner_noise_px * rng.standard_normal(uv.shape), np.arange(len(uv))
+    """Noisy image points (n, 2) of all corners in the picture, and their numbers (n,)."""
+    in_camera = stops.target.points @ T_cam_board[:3, :3].T + T_cam_board[:3, 3]
+    uv = project(stops.camera, in_camera)
+    seen = np.flatnonzero(visible(stops.camera, in_camera, uv))
+    uv = uv + stops.camera.corner_noise_px * rng.standard_normal(uv.shape)
+    return uv[seen], seen
 
 
 def _cloud(stops: Stops, T_cam_board: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -179,12 +245,26 @@ def load_stops(path: Path) -> Stops | None:
         range_noise_m=lidar.range_noise_m,
         seed=fields["seed"].whole(0) if "seed" in fields else 0,
         **_places(fields["stops"]),
+        pauses=_pauses(fields["stops"], camera, lidar),
+    )
+
+
+def _pauses(value: YamlValue, camera: SimCamera, lidar: Any) -> Pauses:
+    """What the section `stops` says of the time at and between places."""
+    keys = {"hold": "hold_s", "carry": "carry_s", "sway": "sway_m"}
+    chosen = {keys[key]: field.positive() for key, field in value.entries().items() if key in keys}
+    late_s = camera.time_offset_s - lidar.time_offset_s
+    rates = camera.rate_hz, lidar.rate_hz
+    return (
+        Pauses(camera_hz=rates[0], lidar_hz=rates[1], scan_s=1.0 / rates[1], late_s=late_s, **chosen)
+        if chosen
+        else ONCE
     )
 
 
 def _places(value: YamlValue) -> dict[str, Any]:
     """The fields of `Stops` that the section `stops` sets."""
-    fields = value.record(("count",), ("distance", "board_angles_deg", "range_offset", "room"))
+    fields = value.record(("count",), ("distance", "board_angles_deg", "range_offset", "room", "hold", "carry", "sway"))
     chosen: dict[str, Any] = {"n_stops": fields["count"].whole(1)}
     if "distance" in fields:
         chosen["distance_m"] = interval(fields["distance"])
@@ -197,27 +277,51 @@ def _places(value: YamlValue) -> dict[str, Any]:
     return chosen
 
 
-def write_stops(stops: Stops, seed: int, path: Path) -> None:
-    """Writes corners, clouds, their truth and their rig file to the new folder `path`, atomically. Raises
-    RecordingError if `path` exists or cannot be written."""
+def write_stops(stops: Stops, seed: int, path: Path, as_bag: bool = False) -> None:
+    """Writes corners and clouds, or images and clouds as a bag of ROS 2, their truth and their rig file to the new
+    folder `path`, atomically. Raises RecordingError if `path` exists or cannot be written, RigError for a bag of a rig
+    that does not record between the places."""
+    if as_bag and stops.pauses is ONCE:
+        raise RigError("a bag of stops needs `hold` in the section stops; give it, or leave --level out.")
     measured, boards = simulate_stops(stops, seed)
-    camera, lidar = stops.camera, measured.lidars[0]
-    rig = replace(stops.rig(knows_lens=False), settings=Settings())
-    lens = {"intrinsics": list(map(float, camera.intrinsics)), "distortion": list(map(float, camera.distortion))}
-    truth = {
-        "seed": seed,
-        "sensors": {
-            "cam0": {"type": "camera", "model": camera.model} | lens,
-            "lidar0": {
-                "type": "lidar", "T_cam0_lidar0": stops.T_cam_lidar.tolist(), "range_offset": stops.range_offset_m
-            },
-        },
-        "T_cam0_board": boards.tolist(),
-    }  # fmt: skip
+    rig = replace(stops.rig(knows_lens=False, topics=as_bag), settings=Settings())
     with atomic_output(path) as folder:
-        write_corners(below(folder, camera.name), measured.cameras[0], stops.target)
-        scans = {name: getattr(lidar, name) for name in ("stamps_ns", "start", "offset_s", "xyz", "plane")}
-        below(folder, lidar.name).mkdir(parents=True)
-        np.savez(below(folder, lidar.name) / "scans.npz", **scans)
-        for name, plain in (("rig.yaml", rig_to_dict(rig)), ("truth.yaml", truth)):
+        if as_bag:
+            _write_bag(stops, seed, boards, measured.lidars[0], folder)
+        else:
+            write_corners(below(folder, stops.camera.name), measured.cameras[0], stops.target)
+            _record(measured.lidars[0], 0).write_table(below(folder, "lidar0"))
+        for name, plain in (("rig.yaml", rig_to_dict(rig)), ("truth.yaml", _truth(stops, seed, boards))):
             write_text(folder / name, yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=1000))
+
+
+def _truth(stops: Stops, seed: int, boards: np.ndarray) -> dict[str, Any]:
+    camera = stops.camera
+    lens = {"intrinsics": list(map(float, camera.intrinsics)), "distortion": list(map(float, camera.distortion))}
+    lidar = {"type": "lidar", "T_cam0_lidar0": stops.T_cam_lidar.tolist(), "range_offset": stops.range_offset_m}
+    sensors = {"cam0": {"type": "camera", "model": camera.model} | lens, "lidar0": lidar}
+    return {"seed": seed, "sensors": sensors, "T_cam0_board": boards.tolist()}
+
+
+def _record(lidar: LidarStream, offset_ns: int) -> Any:
+    """Table and messages of the clouds, as the simulator of a LiDAR writes them."""
+    kind: Any = simulated_kinds()["lidar"]
+    return kind(lidar.name, np.eye(4)).record(lidar, offset_ns)
+
+
+def _write_bag(stops: Stops, seed: int, boards: np.ndarray, lidar: LidarStream, path: Path) -> None:
+    """Writes rendered images of the board, and `lidar`, in order of their true instants."""
+    topic = _record(lidar, -round(1e9 * stops.pauses.late_s)).topic
+    renderer, rng = Renderer(stops.camera, Imaging(blur_px=0.8, noise=2.0)), np.random.default_rng([seed, 1])
+    seconds = stops.pauses.instants(stops.n_stops, stops.pauses.camera_hz)
+    moments = zip(nanoseconds(seconds).tolist(), stops.pauses.poses(boards, seconds), strict=True)
+
+    def take(bag: BagWriter, stamp_ns: int, T: np.ndarray) -> Any:
+        picture = renderer.picture([Sheet(stops.target, T)], np.eye(4)[None], rng)
+        return bag.image(stamp_ns, stops.camera.name, picture.pixels)
+
+    images = ((ns, _IMAGES, partial(take, stamp_ns=ns, T=T)) for ns, T in moments)
+    clouds = ((ns, topic.name, make) for ns, make in topic.events)
+    with BagWriter("mcap", path, {_IMAGES: IMAGE, topic.name: topic.message}) as bag:
+        for at_ns, name, make in heapq.merge(images, clouds, key=lambda event: event[0]):
+            bag.write(name, make(bag), at_ns)

@@ -19,6 +19,7 @@ from icalib.detection.detectors import checkerboard_in, tags_in
 from icalib.errors import RecordingError
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.geometry.targets import Target
+from icalib.initialize.smooth_trajectory import common_stops, follow_closely
 from icalib.sensors.camera.initialize.intrinsics import fitting_model
 from icalib.sensors.camera.read import CameraInfo
 from icalib.sensors.camera.read import corners as recorded_corners
@@ -60,7 +61,8 @@ class TargetView:
     unknown. tilt_deg: 10th, 50th and 90th percentile of the angle between the optical axis and the target's normal;
     distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown. model:
     camera model that fits the corners, None if they are too few; errors_px: of the models compared, see
-    `fitting_model`.
+    `fitting_model`. stops: places at which the target was at rest; None if images do not
+    follow one another.
     """
 
     camera: str
@@ -74,6 +76,7 @@ class TargetView:
     problem: str = ""
     model: str | None = None
     errors_px: Mapping[str, float] = field(default_factory=dict)
+    stops: int | None = None
 
 
 @dataclass(frozen=True)
@@ -215,7 +218,7 @@ def target_view(
         return TargetView(name, None, 0, 0, None, None, None, problem=str(error))
     count = np.diff(corners.start)
     tilt, ratio = _poses(corners, target)
-    model, errors_px = None, {}
+    (model, errors_px), view = (None, {}), (corners.stamps_ns, corners.by_point())
     if resolution is not None and (count > 0).sum() >= FEWEST_FOR_MODEL:
         model, errors_px = fitting_model(corners, target, resolution, (DEFAULT_MODEL, FISHEYE_MODEL))
     return TargetView(
@@ -229,6 +232,7 @@ def target_view(
         notes=notes,
         model=model,
         errors_px=errors_px,
+        stops=len(common_stops([view])) if follow_closely(view[0]) else None,
     )
 
 

@@ -24,7 +24,7 @@ from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, times
 from icalib.rig import Lidar, Rig
-from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes
+from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes, wrong_sheets
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.patch_factor import PatchFactor
 from icalib.sensors.lidar.residual import LidarFactor, less_offset
@@ -49,7 +49,7 @@ def assess(a: AssessedEstimate) -> Assessment:
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
         notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a)),
-        warnings=warnings(a.inputs, a.estimate),
+        warnings=chain(warnings(a.inputs, a.estimate), wrong_sheets(a)),
     )
 
 

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from icalib.base.remark import Remark
 from icalib.estimate.inputs import Inputs
+from icalib.estimate.problem import pass_at
 from icalib.observability.assessor import AssessedEstimate, Assessment
 from icalib.optim.state import State, in_recording
 from icalib.result.calibration import Plane
 from icalib.rig import ParameterSpec
-from icalib.sensors.lidar.board_factor import GATE_SIGMAS, ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints, in_scene
+from icalib.sensors.lidar.board_factor import ON_BOARDS, BoardFactor, in_scene
 from icalib.sensors.lidar.spec import RANGE_OFFSET
 from icalib.sensors.lidar.stream import LidarResiduals, LidarStream
 
@@ -26,7 +26,7 @@ def on_boards(a: AssessedEstimate) -> Assessment:
     """What results say of LiDARs at rest."""
     state = a.estimate.outcome.state
     return Assessment(
-        planes=_sheets(a, state), residuals=_residuals(a, state), notes=_notes(a), warnings=_wrong_sheets(a)
+        planes=_sheets(a, state), residuals=_residuals(a, state), notes=_notes(a), warnings=wrong_sheets(a)
     )
 
 
@@ -96,21 +96,22 @@ def ranges_offset(a: AssessedEstimate, lidar: str) -> Iterator[Remark]:
         )
 
 
-def _wrong_sheets(a: AssessedEstimate) -> Iterator[Remark]:
-    """Warnings on edges of sheets that are elsewhere than `sheet` in the rig file says."""
-    state, bodies = a.estimate.outcome.state, a.inputs.bodies
-    for f in _factors(a):
-        stream = a.inputs.measurements.streams[f.name]
+def wrong_sheets(a: AssessedEstimate) -> Iterator[Remark]:
+    """Warnings on edges of sheets that are elsewhere than `sheet` in the rig file says, at rest or in motion."""
+    state, bodies, association = a.estimate.outcome.state, a.inputs.bodies, a.inputs.association
+    at = pass_at(a.inputs, state)
+    for k, lidar in enumerate(a.inputs.rig.lidars if bodies.used else ()):
+        if not association.at_rest and not (association.sheets and association.points_on_sheets[k].any()):
+            continue
+        stream, noise = a.inputs.measurements.streams[lidar.name], a.estimate.measurement_model.noise[lidar.name]
         assert isinstance(stream, LidarStream)
         sides = np.diff(bodies.target.outlines[list(bodies.used)], axis=1)
-        off_m = GATE_SIGMAS * float(np.hypot(f.noise.sigma, f.noise.beam_sigma))
-        _, edges = BoardPoints.of(stream, bodies, state, off_m, SEARCHED_SHARE * float(sides.min()))
-        off = replace(f, kind=ON_EDGES, points=edges).rows_of_points(slice(None), state, False)[0].residual
-        growth = float(np.median(off)) if len(off) else 0.0
+        _, edges = BoardFactor.seen(stream, noise, at, SEARCHED_SHARE * float(sides.min()))
+        growth = float(np.median(edges.off(state))) if len(edges.sigma) else 0.0
         if abs(growth) > WIDEST_BEAM_M:
             yield Remark(
                 "sheet_size_wrong",
-                f"{f.name} sees the edges of the target {1e3 * abs(growth):.0f} mm farther "
+                f"{lidar.name} sees the edges of the target {1e3 * abs(growth):.0f} mm farther "
                 f"{'out' if growth > 0.0 else 'in'} than `sheet` in the rig file says"
                 f"{', or bright edges bleed' if growth > 0.0 else ''}; measure the sheet again, or leave `sheet` out.",
             )

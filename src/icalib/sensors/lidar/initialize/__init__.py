@@ -26,10 +26,10 @@ from icalib.initialize.smooth_trajectory import BodyPoses
 from icalib.optim.state import State
 from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.initialize.association import lidar_values, state_from_lidar, with_lidars
-from icalib.sensors.lidar.initialize.boards import guess_at_rest, is_at_rest
+from icalib.sensors.lidar.initialize.boards import at_places, guess_at_rest, stands_still
 from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
-from icalib.sensors.lidar.initialize.surroundings import are_stops, guess_by_surroundings, stops
+from icalib.sensors.lidar.initialize.surroundings import are_stops, at_stops, guess_by_surroundings, stops
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error, leading
 from icalib.sensors.lidar.spec import RANGE_OFFSET
 
@@ -42,9 +42,11 @@ class LidarInitializer(Initializer[Lidar]):
 
     def prepared(self, rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
         """The recordings without points on the robot itself. At rest, which a rig without an IMU that sees a target may
-        be, all points keep their place."""
-        at_rest = rig.imu is None and (rig.has_target or are_stops(rig, recordings))
-        return recordings if at_rest else [without_self_returns(m) for m in recordings]
+        be, all points keep their place; one that stops has a cloud of each stop."""
+        if rig.imu is None and rig.has_target:
+            return at_places(rig, recordings)
+        recordings = at_stops(rig, recordings)
+        return recordings if are_stops(rig, recordings) else [without_self_returns(m) for m in recordings]
 
     def motion_source(self, rig: Rig) -> MotionSource | None:
         return MotionSource(BY_SCANS, tuple(s.name for s in rig.lidars)) if rig.lidars else None
@@ -93,7 +95,7 @@ class LidarInitializer(Initializer[Lidar]):
         """See `Initializer`: by the target in images and clouds, or by what LiDARs see alike."""
         if are_stops(rig, recordings):
             return guess_by_surroundings(rig, recordings)
-        if rig.has_target and is_at_rest(rig, body_poses):
+        if rig.has_target and stands_still(rig, body_poses):
             return guess_at_rest(rig, recordings, body_poses, values)
         return None
 

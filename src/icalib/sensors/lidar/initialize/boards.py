@@ -16,7 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
-from icalib.data.measurements import LidarStream, Measurements
+from icalib.base.remark import Remark
+from icalib.data.measurements import CornerStream, LidarStream, Measurements
 from icalib.data.stamps import stands_still_between
 from icalib.errors import EstimationError
 from icalib.estimate.inputs import Inputs, inputs_for, with_association
@@ -24,7 +25,7 @@ from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry import so3
 from icalib.geometry.targets.base import BOARD
 from icalib.initialize.initializer import InitialGuess, Values, stated_values
-from icalib.initialize.smooth_trajectory import BodyPoses
+from icalib.initialize.smooth_trajectory import BodyPoses, Differ, changes, common_stops, follow_closely
 from icalib.motion.factor import Extrinsics
 from icalib.motion.point_planes import AT_REST
 from icalib.optim.state import State, in_recording
@@ -204,7 +205,7 @@ def _fit(sheets: Sheets, clouds: Sequence[np.ndarray], pose: Extrinsics) -> Extr
 SAME_STOP_SHARE = 0.2  # of the time between stops: images and clouds nearer in time belong to the same stop
 
 
-def is_at_rest(rig: Rig, body: Sequence[BodyPoses]) -> bool:
+def stands_still(rig: Rig, body: Sequence[BodyPoses]) -> bool:
     """Whether the rig has only cameras and LiDARs, and stands still at each pose of its body."""
     others = {s.sensor_type for s in rig.mounted} - {"camera", "lidar"}
     return not others and all(stands_still_between(p.seconds, p.rotation, p.position) for p in body)
@@ -279,3 +280,99 @@ def _extrinsics(inputs: Inputs, sensor: Lidar, recordings: Sequence[Measurements
         )
     pose, _ = best
     return {(sensor.name, "rotation"): pose.R, (sensor.name, "translation"): pose.p}
+
+
+# Recordings that go on while the board is carried from place to place.
+
+CELL_DEG = 3.0  # of azimuth and elevation: a few beams of a spinning LiDAR
+STATIC_PAIRS = 12  # of clouds that are compared
+_FAR_NS = 10**18  # no recording is that long
+STATIC_RATIO = 2.0  # of the changes between clouds far apart and successive ones: 1 of a LiDAR that stands still
+
+
+def at_places(rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+    """The recordings with an image and a cloud of each place at which the board was at rest, if images follow one
+    another while the LiDAR stands still. Raises EstimationError if these places are too few."""
+    others = {s.sensor_type for s in rig.mounted} - {"camera", "lidar"}
+    if others or not (rig.cameras and rig.lidars):
+        return recordings
+    carried = [_carries_a_board(m) for m in recordings]
+    stops = [
+        common_stops([(s.stamps_ns, s.by_point()) for s in m.cameras]) if k else None
+        for m, k in zip(recordings, carried, strict=True)
+    ]
+    count = sum(len(k) for k in stops if k is not None)
+    if all(carried) and count < FEWEST_STOPS:
+        raise EstimationError(
+            f"{rig.lidars[0].name} stands still, and the cameras see the target at rest in only {count} of the at "
+            f"least {FEWEST_STOPS} places that are needed; hold the board still for two seconds at each of ten places."
+        )
+    return [m if k is None else noting_stops(reduced(m, k)) for m, k in zip(recordings, stops, strict=True)]
+
+
+def _carries_a_board(m: Measurements) -> bool:
+    """Whether images follow one another while the first LiDAR stands still."""
+    return bool(m.cameras) and all(follow_closely(s.stamps_ns) for s in m.cameras) and sees_the_same(m.lidars[0])
+
+
+def sees_the_same(stream: LidarStream) -> bool:
+    """Whether the view of a LiDAR hardly changes, or its clouds do not follow one another."""
+    if not follow_closely(stream.stamps_ns):
+        return True
+    k = np.linspace(0, len(stream.stamps_ns) - 2, STATIC_PAIRS).astype(int)
+    scans = np.unique(np.concatenate([k, k + 1]))
+    differ = cloud_changes(stream, scans)
+    i, j = np.searchsorted(scans, k), np.searchsorted(scans, np.roll(k, len(k) // 2))
+    return bool(np.median(differ(i, j)) < STATIC_RATIO * np.median(differ(i, i + 1)))
+
+
+def cloud_changes(stream: LidarStream, scans: np.ndarray) -> Differ:
+    """Differences [m] of the clouds `scans`: the median over directions of the change of the mean range."""
+    n_azimuth, n_elevation = round(360.0 / CELL_DEG), round(180.0 / CELL_DEG)
+    ranges = np.full((len(scans), n_azimuth * n_elevation, 1), np.nan, np.float32)
+    for row, k in zip(ranges[:, :, 0], scans, strict=True):
+        x, y, z = stream.xyz[stream.start[k] : stream.start[k + 1]].T
+        azimuth = (np.rad2deg(np.arctan2(y, x)) + 180.0) / CELL_DEG
+        elevation = (np.rad2deg(np.arctan2(z, np.hypot(x, y))) + 90.0) / CELL_DEG
+        cell = np.minimum(elevation.astype(int), n_elevation - 1) * n_azimuth + azimuth.astype(int) % n_azimuth
+        count = np.bincount(cell, minlength=len(row))
+        total = np.bincount(cell, np.sqrt(x * x + y * y + z * z), minlength=len(row))
+        row[count > 0] = total[count > 0] / count[count > 0]
+    return changes(ranges)
+
+
+def reduced(m: Measurements, stops: np.ndarray) -> Measurements:
+    """The recording with the image of each camera and the cloud of each LiDAR that are nearest to the middle of each of
+    `stops` (k, 2) [ns], stamped as the first of these sensors has it. Raises EstimationError if a sensor has none."""
+    middle = stops[:, 0] + (stops[:, 1] - stops[:, 0]) // 2
+    stamps_ns, streams = middle.copy(), (*m.cameras, *m.lidars)
+    for stream in streams:
+        empty = np.diff(stream.start) == 0
+        chosen = np.argmin(np.abs(stream.stamps_ns - middle[:, None]) + empty * _FAR_NS, axis=1)
+        at = stream.stamps_ns[chosen]
+        inside = (at >= stops[:, 0]) & (at <= stops[:, 1]) & ~empty[chosen]
+        if not inside.any():
+            raise EstimationError(
+                f"{stream.name} has no image or cloud of the stops that {streams[0].name} shows, by numbers or stamps; "
+                "give what belongs to a stop the same number, or record all sensors by one clock."
+            )
+        if stream is streams[0]:
+            stamps_ns[inside] = at[inside]
+        m = m.with_streams(_at(stream, chosen[inside], stamps_ns[inside]))
+    return m
+
+
+def noting_stops(m: Measurements) -> Measurements:
+    """The recording with a note on the stops that it has been reduced to."""
+    n = max(len(s.stamps_ns) for s in m.lidars)
+    words = f"stops found: {n}. Of each, what a sensor measured in its middle is used. No time_offset is estimated."
+    return replace(m, notes=(*m.notes, Remark("stops_found", words)))
+
+
+def _at(stream: CornerStream | LidarStream, which: np.ndarray, stamps_ns: np.ndarray) -> CornerStream | LidarStream:
+    """The images or clouds `which` (k,), each taken at one instant of `stamps_ns` (k,)."""
+    if isinstance(stream, CornerStream):
+        rows = np.flatnonzero(np.isin(stream.image, which))
+        return stream.of_rows(rows, stamps_ns, np.diff(stream.start)[which])
+    scans = stream.of_scans(np.isin(np.arange(len(stream.stamps_ns)), which), stamps_ns)
+    return replace(scans, offset_s=np.zeros_like(scans.offset_s))

@@ -16,13 +16,24 @@ from icalib.estimate.problem import keyframe_times, keyframes_for, start_values
 from icalib.geometry import so3
 from icalib.geometry.targets import NoTarget
 from icalib.initialize.initializer import InitialGuess, stated_values
-from icalib.initialize.smooth_trajectory import BodyPoses
+from icalib.initialize.rate_alignment import only_axis
+from icalib.initialize.smooth_trajectory import BodyPoses, follow_closely, quiet_motion, rests
+from icalib.initialize.trajectories import SINGLE_AXIS_RATE_RATIO
 from icalib.motion.factor import Extrinsics
 from icalib.motion.point_planes import AT_REST
 from icalib.optim.state import State
 from icalib.rig import Rig
-from icalib.sensors.lidar.initialize.boards import SAME_STOP_SHARE
+from icalib.sensors.lidar.initialize.boards import (
+    FEWEST_STOPS,
+    SAME_STOP_SHARE,
+    cloud_changes,
+    noting_stops,
+    reduced,
+    sees_the_same,
+)
+from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.registration import LEAST_SCORE, SAME_RAD, Registration, Surfels, register
+from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error
 from icalib.sensors.parameter import fixed
 from icalib.sensors.sensor import mounted
 
@@ -31,6 +42,45 @@ def are_stops(rig: Rig, recordings: Sequence[Measurements]) -> bool:
     """Whether the rig has LiDARs only, each cloud of which is a stop: clouds are too far apart to show a motion."""
     steps = [np.diff(s.seconds) for m in recordings for s in m.lidars]
     return len(rig.lidars) == len(rig.sensors) and all((step > STREAM_S).all() for step in steps)
+
+
+def at_stops(rig: Rig, recordings: Sequence[Measurements]) -> Sequence[Measurements]:
+    """The recordings of LiDARs alone with one cloud of each at each stop, if all recordings stop and their motion shows
+    less: because there is none, the scene does not show it, or the rig turns about one axis only."""
+    if len(rig.lidars) < 2 or len(rig.lidars) < len(rig.sensors):
+        return recordings
+    if not all(follow_closely(m.lidars[0].stamps_ns) for m in recordings):
+        return recordings
+    intervals = [_rests(m.lidars[0]) for m in recordings]
+    if not all(len(x) for x in intervals):
+        return recordings
+    streams = [stream for m in recordings for stream in m.lidars]
+    if all(map(sees_the_same, streams)) or degeneracy_error(streams) is not None:
+        return [noting_stops(reduced(m, x)) for m, x in zip(recordings, intervals, strict=True)]
+    if sum(map(len, intervals)) < FEWEST_STOPS or not all(_turns_about_one_axis(m.lidars[0]) for m in recordings):
+        return recordings
+    try:
+        still = [noting_stops(reduced(m, x)) for m, x in zip(recordings, intervals, strict=True)]
+        guess_by_surroundings(rig, still)
+    except EstimationError:
+        return recordings
+    return still
+
+
+def _rests(stream: LidarStream) -> np.ndarray:
+    """(k, 2) first and last stamp [ns] of each stop of a LiDAR."""
+    n = len(stream.stamps_ns)
+    differ = cloud_changes(stream, np.arange(n))
+    return stream.stamps_ns[rests(stream.seconds, differ, quiet_motion(n, differ))]
+
+
+def _turns_about_one_axis(stream: LidarStream) -> bool:
+    """Whether the LiDAR turned about one axis only, as on a floor, by its odometry."""
+    try:
+        R = scan_poses(stream).rotation
+    except EstimationError:
+        return True
+    return only_axis(so3.log_many(np.ascontiguousarray(R[0].T @ R)), SINGLE_AXIS_RATE_RATIO) is not None
 
 
 def stops(m: Measurements) -> BodyPoses:
@@ -67,21 +117,10 @@ def guess_by_surroundings(rig: Rig, recordings: Sequence[Measurements]) -> Initi
 
 
 def _same_stamps(m: Measurements, body: str) -> Measurements:
-    """The recording with the clouds of stops at which the body has one, at its stamps."""
-    reference: LidarStream = m.streams[body]  # pyright: ignore[reportAssignmentType]
-    stop_s = float(np.diff(reference.seconds).min(initial=np.inf))
-    for stream in m.lidars:
-        apart = np.abs(stream.stamps_ns - reference.stamps_ns[:, None])
-        scan = np.argmin(apart, axis=1)
-        near = np.flatnonzero(apart[np.arange(len(scan)), scan] * 1e-9 <= SAME_STOP_SHARE * stop_s)
-        if not len(near):
-            raise EstimationError(
-                f"{stream.name} has no cloud of the stops at which {body} has one, by their numbers or stamps; "
-                "give the clouds of a stop the same number."
-            )
-        kept = np.isin(np.arange(len(stream.stamps_ns)), scan[near])
-        m = m.with_streams(stream.of_scans(kept, reference.stamps_ns[near]))
-    return m
+    """The recording with the clouds of stops at which the body has one. Raises EstimationError if there are none."""
+    at = m.streams[body].stamps_ns
+    near_ns = int(SAME_STOP_SHARE * np.diff(at).min(initial=10**18))
+    return reduced(m, at[:, None] + np.array([-near_ns, near_ns]))
 
 
 def _poses(streams: dict[str, LidarStream], known: dict[str, Extrinsics]) -> dict[str, Extrinsics]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,7 +32,7 @@ from icalib.initialize.hand_eye import (
     unexplained_motion,
 )
 from icalib.initialize.initializer import stated_values
-from icalib.initialize.smooth_trajectory import BodyPoses
+from icalib.initialize.smooth_trajectory import MAX_CLOCK_OFFSET_S, BodyPoses, is_at_rest, rest_motion
 from icalib.model.sensor_model import FRAME, frame_of
 from icalib.motion.factor import Extrinsics
 from icalib.motion.poses import MERGED_WITHIN_S
@@ -231,12 +232,8 @@ def _hand_eye(rig: Rig, sensor: PoseSensor, paired: _PairedPoses) -> HandEye:
 
 # Matches poses of two sensors that were taken at the same stop of a robot.
 
-MAX_CLOCK_OFFSET_S = 0.2  # largest clock offset; a sensor must be at rest this long before and after an instant
-MAX_REST_GAP_S = 2.0  # longest gap between the two poses that decide whether a sensor is at rest
-MAX_REST_MOTION = 0.03  # largest motion between these poses, as a share of the median motion between random poses
 MAX_STOP_SHARE = 0.2  # share of the time between stops; stamps closer than this belong to the same stop
 MIN_STOP_INTERVAL_S = 1.0  # least median step between poses of a sensor that measures at stops only
-N_MOTION_SAMPLES = 500  # pairs of random poses
 
 
 def matched_poses(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
@@ -256,7 +253,9 @@ def matched_poses(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, np.nd
         near = apart < MAX_STOP_SHARE * min(steps)
         return i[near], k[near]
     dense = body if steps[0] < steps[1] else sensor
-    rest = same | _is_at_rest(dense, 0.5 * (body.seconds[i] + sensor.seconds[k]))
+    differ = partial(moved, dense.rotation, dense.position)
+    limit = rest_motion(len(dense.seconds), differ)
+    rest = same | is_at_rest(dense.seconds, 0.5 * (body.seconds[i] + sensor.seconds[k]), differ, limit)
     rest &= apart <= MAX_CLOCK_OFFSET_S
     return i[rest], k[rest]
 
@@ -267,16 +266,3 @@ def _mutually_nearest(body: BodyPoses, sensor: BodyPoses) -> tuple[np.ndarray, n
     i = np.searchsorted(0.5 * (body.seconds[1:] + body.seconds[:-1]), sensor.seconds)
     matched = np.flatnonzero(i[k] == np.arange(len(k)))
     return matched, k[matched]
-
-
-def _is_at_rest(poses: BodyPoses, seconds: np.ndarray) -> np.ndarray:
-    """(n,) whether a sensor is at rest at `seconds` (n,). Its poses just outside +- MAX_CLOCK_OFFSET_S must be at most
-    MAX_REST_GAP_S apart and nearly equal."""
-    last = len(poses.seconds) - 1
-    before = np.clip(np.searchsorted(poses.seconds, seconds - MAX_CLOCK_OFFSET_S, side="right") - 1, 0, last)
-    after = np.clip(np.searchsorted(poses.seconds, seconds + MAX_CLOCK_OFFSET_S), 0, last)
-    rng = np.random.default_rng(0)
-    a, b = rng.integers(0, last + 1, (2, N_MOTION_SAMPLES))
-    typical = float(np.median(moved(poses.rotation, poses.position, a, b)))
-    covered = poses.seconds[after] - poses.seconds[before] <= MAX_REST_GAP_S
-    return covered & (moved(poses.rotation, poses.position, before, after) < MAX_REST_MOTION * typical)
