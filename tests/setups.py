@@ -190,7 +190,8 @@ def make_setup(
             values[c.name, name] = value
         values |= {(c.name, "clock_rate"): np.zeros(1), (c.name, MIDDLE): c.seconds[-1:] / 3.0}
         times.append(c.seconds + offset)
-    entries += [(c.name, "clock_rate", "vector", 1, True) for c in measurements.cameras]
+    for c in measurements.cameras:
+        entries.append((c.name, "clock_rate", "vector", 1, True))
     seconds = place_keyframes(imu, times, spacing, 0.5)
     bias = np.concatenate([truth.gyro_bias[0], truth.accel_bias[0]])
     streams = restrict(bodies, measurements).cameras

@@ -19,7 +19,7 @@ from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import EstimatedMotion
 from icalib.optim.arrowhead import NO_DIRECTIONS, Piece, Prior, in_parallel, make_pieces, solve
-from icalib.optim.state import Layout, State, make_layout
+from icalib.optim.state import Entry, Layout, State, make_layout
 from icalib.rig import ImuNoise
 from icalib.sensors.imu.residual import ImuFactor
 
@@ -211,13 +211,11 @@ def make_world(
         ("wheel0", "radii"): drive.radii,
         ("wheel0", "baseline"): np.array([drive.baseline]),
     }
-    layout = make_layout(
-        [
-            (s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")
-            for (s, n), v in values.items()
-        ]
-        + [("wheel0", "clock_rate", "vector", 1, False)]
-    )
+    entries: list[Entry] = [
+        (s, n, "rotation" if n == "rotation" else "vector", v.size if n != "rotation" else 3, s != "imu0")
+        for (s, n), v in values.items()
+    ]
+    layout = make_layout([*entries, ("wheel0", "clock_rate", "vector", 1, False)])
     state = State(keyframes, R, p, v, np.tile(BIAS, (len(keyframes), 1)), values)
     return World(drive, ImuData.build(stream, NOISE), seconds, drive.angles(seconds + offset), layout, state)
 
