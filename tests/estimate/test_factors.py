@@ -32,7 +32,7 @@ from icalib.geometry.targets import AprilGrid, Checkerboard, Scene
 from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import output_at
 from icalib.motion.imu_data import ImuData
-from icalib.motion.poses import MIDDLE, EstimatedMotion, offset_at, poses_at
+from icalib.motion.poses import MIDDLE, EstimatedMotion, offset_at, poses_at, seconds_at
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
 from icalib.optim.rows import MIN_CURVATURE_RATIO
 from icalib.optim.state import State, in_recording, make_layout
@@ -723,12 +723,12 @@ def moving_board_sample(unlike, setup_of):
     old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     layout = make_layout([*old, *(spec.entry("lidar0") for spec in Lidar.parameters), SHEET_MIDDLE.entry("board0")])
     more = {b.key: 0.1 * rng.normal(size=b.size) for b in layout.blocks if b.key not in setup.state.values}
-    more["lidar0", "rotation"] = so3.exp(rng.normal(size=3))
+    more |= {("lidar0", "rotation"): so3.exp(rng.normal(size=3)), ("lidar0", MIDDLE): np.array([0.2])}
     setup = replace(setup, layout=layout, state=replace(setup.state, values=setup.state.values | more))
     setup = with_two_clocks(setup)
     layout, state = setup.layout, setup.perturbed(rng, 0.02)
     keyframe = np.repeat(np.sort(rng.integers(1, len(state.seconds) - 1, n // 2)), 2)
-    seconds = state.seconds[keyframe] - offset_at(state, "lidar0", keyframe) + rng.uniform(-0.03, 0.03, n)
+    seconds = seconds_at(state, "lidar0")[keyframe] + rng.uniform(-0.03, 0.03, n)
     normal = rng.normal(size=(n, 3)) * [1.0, 1.0, 0.0]
     points = BoardPoints(
         seconds, 3.0 * rng.normal(size=(n, 3)), keyframe, keyframe, np.zeros(n, dtype=int), normal, rng.normal(size=n),
