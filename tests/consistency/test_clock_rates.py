@@ -89,3 +89,22 @@ def test_without_noise_rates_are_exact_to_their_prior() -> None:
         rate, std = result.value(sensor, "clock_rate")[0], result.std(sensor, "clock_rate")[0]
         true = simulation.truth.values[sensor]["clock_rate"][0]
         assert abs(rate - true) < 3.0 * abs(true) * (std / 50.0) ** 2
+
+
+def test_a_clock_drifts_from_one_recording_to_the_next() -> None:
+    """The second recording begins a minute after the first, on the same clocks."""
+    pause_s, rate, seconds = 60.0, 40.0, 8.0
+    first, second = (simulate(drifting(handheld(seconds), rate), seed) for seed in (5, 6))
+    later = []
+    for name, stream in second.measurements.streams.items():
+        pace = 1.0 + 1e-6 * float(second.truth.values[name].get("clock_rate", np.zeros(1))[0])
+        later.append(replace(stream, stamps_ns=stream.stamps_ns + round(1e9 * pause_s / pace)))
+    both = [first.measurements, second.measurements.with_streams(*later)]
+    result = calibrate_measurements(rig_for(first.scenario), both)
+    for sensor in ("cam0", "cam1"):
+        true = first.truth.values[sensor]
+        middle = true["time_offset"] + 1e-6 * true["clock_rate"] * 0.5 * pause_s
+        for name, value in (("clock_rate", true["clock_rate"]), ("time_offset", middle)):
+            off = result.value(sensor, name) - value
+            assert (np.abs(off) < 4.0 * result.group(sensor, name).std_formal).all(), (sensor, name, off)
+        assert result.std(sensor, "clock_rate")[0] < 0.5

@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
+from icalib.errors import RigError
 from icalib.sensors.fields import (
     TABLE,
     axes_or_none,
@@ -195,6 +196,8 @@ class ImuSensor(MountedSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.clock_rate.mode != "free" or self.clock_rate.value is not None:
+            raise RigError(f"{self.name}: the rate of an IMU's clock is not estimated; remove clock_rate.")
         if self.intrinsics is BY_CLASS:
             object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
         elif self.intrinsics.mode == "free":
