@@ -88,6 +88,7 @@ EXAMPLES = {
     "numbers(lens.distortion)": "[0, 0, 0, 0]",
     "values": "gyro: 0.001, gyro_walk: 1e-05, accel: 0.01, accel_walk: 0.0001",
     "source": "kalibr",
+    "wider": "1000",
     "'relative' if _drifts(topic) and (not leads) else 'absolute'": "relative",
 }
 # Words that the user replaces by names, numbers or a list.
