@@ -343,6 +343,10 @@ CASES: dict[str, Case] = {
         turning("single_axis"),
         refused="turned about one axis only.*turn the rig about (the . and . axes of imu0|two axes perp.*) as well",
     ),
+    # The data show the attitude of the board to 1 deg, and a start value 9 deg off must not take its place.
+    "nobody guesses the attitude of the board": Case(
+        lambda: simulate(moving(handheld(20.0), "single_axis"), 58), [known()], guessed("prior", 58)
+    ),
     # The first reason is the true one.
     "nothing is wrong": Case(BY_HAND, [has_no_reason, known()], lens("fixed")),
     # Stamps that run fast need an offset that falls.
