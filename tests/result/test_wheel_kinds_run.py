@@ -70,7 +70,7 @@ def run(request, tmp_path_factory) -> tuple[str, Path]:
 def test_parameters_are_named_and_right(run):
     reports, folder = run
     own = yaml.safe_load((folder / "out" / "calibration.yaml").read_text())["sensors"]["wheel0"]
-    assert set(own["parameters"]) == {*PARAMETERS[reports], "ground_height", "clock_rate"}
+    assert set(own["parameters"]) == {*PARAMETERS[reports], "ground_height"}
     for name, true in PARAMETERS[reports].items():
         assert abs(own["parameters"][name] - true) < 4.0 * own["std"]["parameters"][name], name
     found = load_calibration(folder / "out")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -197,7 +197,11 @@ def attempt(
     lap, on_step, on_visit: progress of stages and solver. Raises EstimationError if the data do not determine an
     estimate.
     """
-    make = partial(_make_attempt, recordings=recordings, lap=lap, on_step=on_step, on_visit=on_visit)
+    solve = partial(_solved, on_step=on_step, on_visit=on_visit)
+
+    def make(rig: Rig) -> Attempt:
+        return solve(*guess_of_rig(rig, recordings, lap))
+
     try:
         with refusing_far_off():
             first, failed = _attempt_or_error(rig, make)
@@ -208,7 +212,7 @@ def attempt(
     misfit = np.inf if first is None else first.misfit
     if first is not None and misfit < POOR_FIT_RATIO:
         return first
-    fallback = _without_guesses(rig, make)
+    fallback = _without_guesses(rig, make, solve)
     if fallback is not None and fallback.misfit < CLEARLY_BETTER_RATIO * misfit:
         return fallback
     fallback = _contradicting_attempt(rig, make)
@@ -240,47 +244,47 @@ def explained_failure(
     return motion_kinds(rig)[0].explained(estimate) or failed
 
 
-def _make_attempt(
-    rig: Rig,
-    recordings: Sequence[Measurements],
-    lap: Callable[[str], None],
-    on_step: Callable[[str, Step], None],
-    on_visit: OnVisit,
+def _solved(
+    inputs: Inputs, state: State, guess: Values, on_step: Callable[[str, Step], None], on_visit: OnVisit
 ) -> Attempt:
-    """Initial guess and estimate of one rig. Raises EstimationError."""
-    inputs, state, guess = guess_of_rig(rig, recordings, lap)
+    """The estimate from an `InitialGuess`. Raises EstimationError."""
     trim_heap()
     try:
         solution = determine(inputs, state, guess, Callbacks(on_step, partial(on_visit, inputs)))
     except EstimationError as error:
         failed = FailedEstimate(inputs.rig, [inputs.measurements], error)
-        if (reason := next(filter(None, (kind.explained(failed) for kind in kinds_of(rig))), None)) is not None:
+        if (reason := next(filter(None, (kind.explained(failed) for kind in kinds_of(inputs.rig))), None)) is not None:
             raise reason from error
         raise
     return Attempt(inputs, solution)
 
 
-def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
-    """The estimate without guesses. If parameters are unobservable then, guesses that agree with it are used after all.
-    None if the rig has no guesses, or the estimate fails."""
+def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt], solve: Callable[..., Attempt]) -> Attempt | None:
+    """The estimate without guesses. If parameters are unobservable then, `solve` repeats it from its own state, with
+    these parameters reset to the guesses that agree with it. None if the rig has no guesses, or the estimate fails."""
     fallback = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None
     if fallback is None:
         return None
-    values = fallback.solution.estimate.outcome.state.values
+    inputs, state = fallback.inputs, fallback.solution.estimate.outcome.state
 
     def agreeing(sensor: Sensor, name: str, p: Parameter) -> Parameter:
-        if p.mode != "free" or p.value is None or name == "time_offset":
-            return Parameter() if p.mode == "free" else p
-        estimate = values.get((sensor.name, name), p.value)
-        return Parameter() if is_contradicted(sensor.spec(name), p.value, estimate) else p
+        stated = getattr(rig.sensors.get(sensor.name), name, p)
+        if p.mode != "free" or stated.value is None or name == "time_offset":
+            return p
+        estimate = state.values.get((sensor.name, name), stated.value)
+        return p if is_contradicted(sensor.spec(name), stated.value, estimate) else stated
 
-    agreeing_rig = with_groups(rig, agreeing)
-    if (
-        fallback.solution.fixed_directions.size
-        and _has_values(agreeing_rig, "free")
-        and (refined := _converged_attempt(agreeing_rig, make)) is not None
-    ):
-        fallback = refined
+    agreeing_rig = with_groups(inputs.rig, agreeing)
+    if fallback.solution.fixed_directions.size and _has_values(agreeing_rig, "free"):
+        inputs = replace(inputs, rig=agreeing_rig)
+        guess = {
+            (sensor.name, name): p.value
+            for sensor, name, p in groups_of(agreeing_rig)
+            if p.mode == "free" and p.value is not None and (sensor.name, name) in state.values
+        }
+        with suppress(EstimationError):
+            refined = solve(inputs, state, guess)
+            fallback = refined if refined.converged else fallback
     return replace(fallback, inputs=replace(fallback.inputs, user_rig=rig))
 
 

@@ -46,20 +46,20 @@ SHEET_MIDDLE = ParameterSpec(
 )
 # Scene parameters have a wide prior sigma, as users give no guess of the vertical, walls or frames. An unobservable
 # direction that moves a sensor and the scene together thus has the prior uncertainty of the sensor.
+# Wide tolerances, so that an unobservable direction is attributed to a sensor and not to a board, plane or frame.
 TILT = ParameterSpec(
     name="tilt",
     size=2,
     manifold="tilt",
     unit="rad",
     labels=AXES[:2],
-    tolerance=radians(0.1),
+    tolerance=radians(10.0),
     prior_sigma=10.0,
     is_auxiliary=True,
     meaning="of the target against the vertical",
     motion="turn the rig through larger angles, so that gravity shows on every axis",
     motion_on_wheels="drive over ramps",
 )
-# Wide tolerances, so that an unobservable direction is attributed to a sensor and not to a plane or frame.
 PLANE = ParameterSpec(
     "plane", 3, "plane", "", ("turn 1", "turn 2", "distance"), (radians(10.0), radians(10.0), 0.5), 10.0
 )

@@ -78,8 +78,10 @@ def topic_or_none(fields: dict[str, YamlValue]) -> str | None:
 
 
 def groups_to_plain(sensor: Sensor) -> dict[str, Any]:
-    """The parameters of the sensor as plain data by name, and clock_restarts if it is true."""
+    """The parameters of the sensor as plain data by name, but for those fixed at their default, and clock_restarts if
+    it is true."""
     plain = {spec.name: parameter_to_plain(getattr(sensor, spec.name)) for spec in sensor.stated()}
+    plain = {name: value for name, value in plain.items() if value is not None}
     return plain | ({"clock_restarts": True} if sensor.clock_restarts else {})
 
 

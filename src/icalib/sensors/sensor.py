@@ -196,13 +196,14 @@ class Sensor:
 @dataclass(frozen=True, kw_only=True)
 class ClockedSensor(Sensor):
     """A sensor with a clock that differs from that of the reference sensor: t_reference = t + time_offset + clock_rate
-    (t - t_mid), see `CLOCK_RATE`. Where the time offset is fixed, so is the rate; that of an IMU is zero.
+    (t - t_mid), see `CLOCK_RATE`. Without a value the rate is zero. Where the time offset is fixed, so
+    is the rate.
 
     clock_restarts: each recording has a separate time offset.
     """
 
     time_offset: Parameter = Parameter()
-    clock_rate: Parameter = Parameter()
+    clock_rate: Parameter = Parameter("fixed")
     clock_restarts: bool = False
 
 

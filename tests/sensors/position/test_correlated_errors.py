@@ -71,9 +71,7 @@ def walking(seed, density, known=WALK, **fields):
     rig = rig_for(sim.scenario, settings=Settings()).with_("gnss0", position_random_walk=known)
     result = calibrate_measurements(rig, [sim.measurements])
     error, std = errors(result, sim)
-    own = [
-        k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.") and "clock_rate" not in name
-    ]
+    own = [k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.")]
     return error, std, error @ np.linalg.solve(result.covariance[np.ix_(own, own)], error), result
 
 
@@ -133,11 +131,7 @@ def test_multipath_is_mostly_covered_by_the_walk_that_the_warning_advises():
         known.append(advised(result))
         error, std, nees, result = walking(seed, 0.0, known[-1], **errors_of_fixes)
         with_walk.append(nees)
-        own = [
-            k
-            for k, name in enumerate(result.covariance_names)
-            if name.startswith("gnss0.") and "clock_rate" not in name
-        ]
+        own = [k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.")]
         covariance = result.covariance[np.ix_(own, own)]
         root = std / np.sqrt(np.diag(covariance))  # empirical factors
         printed.append(error @ np.linalg.solve(covariance * np.outer(root, root), error))

@@ -36,9 +36,7 @@ def errors(result: Calibration, sim: Simulation) -> tuple[np.ndarray, np.ndarray
     T, offsets = sim.truth.T_imu_sensor[result.body], sim.truth.time_offset
     arm = T[:3, :3].T @ (ARM - T[:3, 3])
     offset = np.ravel(result.value("gnss0", "time_offset")) - offsets["gnss0"] + offsets[result.body]
-    own = [
-        k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.") and "clock_rate" not in name
-    ]
+    own = [k for k, name in enumerate(result.covariance_names) if name.startswith("gnss0.")]
     return np.append(result.value("gnss0", "translation") - arm, offset), result.covariance[np.ix_(own, own)]
 
 

@@ -196,7 +196,7 @@ class ImuSensor(MountedSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.clock_rate.mode != "free" or self.clock_rate.value is not None:
+        if self.clock_rate.mode != "fixed" or self.clock_rate.value is not None:
             raise RigError(f"{self.name}: the rate of an IMU's clock is not estimated; remove clock_rate.")
         if self.intrinsics is BY_CLASS:
             object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
