@@ -45,6 +45,8 @@ def refusal(sees: str, imu: bool, others: str, known: str) -> str:
         return "there is no camera, no LiDAR, no pose sensor and no position sensor"
     if not imu and not sees and others in ("lidar", "pose"):
         return "is the only sensor"
+    if not imu and not sees and (others, known) == ("lidar+wheels", "nothing"):
+        return "singular to within rounding"  # in these few points, planes face two directions only, as in a corridor
     if not imu and sees == "tracks" and not {"lidar", "pose"} & set(others.split("+")):
         return "determines the scale"
     return ""

@@ -296,7 +296,9 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
         return with_groups(
             rig,
             lambda sensor, name, p: (
-                p if not dropped(p) else Parameter("free", p.value if lens and name in LENS else None)
+                Parameter("free", p.value if lens and name in LENS else None)
+                if dropped(p) and p.value is not None
+                else p
             ),
         )
 
