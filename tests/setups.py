@@ -188,7 +188,7 @@ def make_setup(
             columns = 3 if name == "rotation" else len(value)
             entries.append((c.name, name, kind, columns, bloom or name != "bloom"))
             values[c.name, name] = value
-        values |= {(c.name, "clock_rate"): np.zeros(1), (c.name, MIDDLE): c.seconds[-1:] / 3.0}
+        values |= {(c.name, "clock_rate"): np.zeros(1), (c.name, MIDDLE): c.seconds[-1:] / 2.0}
         times.append(c.seconds + offset)
     for c in measurements.cameras:
         entries.append((c.name, "clock_rate", "vector", 1, True))
