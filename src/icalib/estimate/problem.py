@@ -240,9 +240,8 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     ]
     for block in layout.free:
         stated, spec = inputs.stated(block), inputs.specs[block.key]
-        if block.name == SHEET_MIDDLE.name:
-            priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
-        if stated is not None and spec.is_auxiliary and stated.mode == "free":
+        is_open = stated is not None and spec.is_auxiliary and stated.mode == "free"
+        if is_open or block.name == SHEET_MIDDLE.name:
             priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
     return (*priors, *stated_priors(inputs))
 
@@ -325,12 +324,14 @@ def begun(inputs: Inputs, state: State) -> State:
     bodies = [(p.begin, 1e-9 * p.shift_ns, p.measurements.imu) for p in inputs.parts]
     moved = np.array([shift for _, shift, _ in bodies])
     edges = np.array([(begin, begin + float(np.ptp(imu.seconds))) for begin, _, imu in bodies if imu is not None])
-    drifting = [s for s in inputs.sensors if inputs.layout.has(s.name, CLOCK_RATE.name)]
-    for sensor in drifting if len(edges) else ():
-        offsets = values[sensor.name, TIME_OFFSET.name]
-        recorded = edges - moved[:, None]  # a clock that does not restart drifts from one recording to the next
-        whole = 0.5 * (recorded.min() + recorded.max()) + moved
-        values[sensor.name, MIDDLE] = (edges.mean(axis=1) if len(offsets) > 1 else whole) - offsets
+    if not len(edges):
+        return state
+    recorded = edges - moved[:, None]  # a clock that does not restart drifts from one recording to the next
+    whole = 0.5 * (recorded.min() + recorded.max()) + moved
+    for sensor in inputs.sensors:
+        if inputs.layout.has(sensor.name, CLOCK_RATE.name):
+            offsets = values[sensor.name, TIME_OFFSET.name]
+            values[sensor.name, MIDDLE] = (edges.mean(axis=1) if len(offsets) > 1 else whole) - offsets
     return replace(state, values=values)
 
 
@@ -497,10 +498,12 @@ def guess_sigma(inputs: Inputs, state: State) -> np.ndarray:
 
 
 def guess_priors(inputs: Inputs, guess: State, times: float = 1.0) -> tuple[Prior, ...]:
-    """Priors about `guess` on all estimated parameters of sensors which have no other prior. Their
-    standard deviation is `times` that of `guess_sigma`."""
+    """Priors about `guess` on all estimated parameters of sensors that have no other prior. Their standard deviation
+    is `times` that of `guess_sigma`."""
     sigma = times * guess_sigma(inputs, guess)
     given = {p.block.key for p in stated_priors(inputs)}
-    open_blocks = (b for b in inputs.layout.free if b.key not in given and not b.is_nuisance)
-    blocks = (b for b in open_blocks if inputs.is_sensor(b.sensor))
-    return tuple(Prior(b, guess.values[b.key], sigma[b.columns]) for b in blocks)
+    return tuple(
+        Prior(b, guess.values[b.key], sigma[b.columns])
+        for b in inputs.layout.free
+        if inputs.is_sensor(b.sensor) and b.key not in given and not b.is_nuisance
+    )
