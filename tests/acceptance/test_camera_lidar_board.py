@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import yaml
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 from tests.typed import not_none
 
 from icalib.cli import main
@@ -126,10 +127,14 @@ def test_points_of_the_board_are_within_its_outline(result):
 
 @pytest.mark.full
 def test_halves_agree(recorded):
+    """As well as their covariance says. Lens and range offset are found by each half, so a half is known to 9 mm."""
     rig, measurements = recorded
-    even, odd = (lidar_pose(calibrate_measurements(rig, stops(measurements, slice(k, None, 2)))) for k in range(2))
-    turn, shift = apart(even.T, odd.T)
-    assert np.rad2deg(np.linalg.norm(turn)) < 0.3
-    assert np.linalg.norm(shift) < 0.015
-    assert (np.abs(turn) < 3.0 * np.hypot(even.rotation_std, odd.rotation_std)).all()
-    assert (np.abs(shift) < 3.0 * np.hypot(even.translation_std, odd.translation_std)).all()
+    even, odd = (calibrate_measurements(rig, stops(measurements, slice(k, None, 2))) for k in range(2))
+    error = np.concatenate(apart(lidar_pose(even).T, lidar_pose(odd).T))
+    assert np.rad2deg(np.linalg.norm(error[:3])) < 0.3
+    covariance = np.zeros((6, 6))
+    for half in (even, odd):
+        columns = np.concatenate([not_none(half.group("lidar0", n).columns) for n in ("rotation", "translation")])
+        assert np.linalg.norm(half.group("lidar0", "translation").std) < 0.009
+        covariance += half.covariance[np.ix_(columns, columns)]
+    assert error @ np.linalg.solve(covariance, error) < chi2.ppf(0.999, 6)
