@@ -122,15 +122,19 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
 
 
 def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
-    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points."""
+    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points. They are
+    repeated where the guess is so far off that they have not converged."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars), MOST_EARLY_POINTS)
     fewer = _thinned_inputs(inputs, step)
     associations: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
     shares = []
-    for k in range(ASSOCIATION_ROUNDS - 1):
-        fewer, state, associations = _associated(fewer, state, k, associations)
-        shares.append(_share_on_planes(fewer.association))
-        state = first_pass(fewer, state)
+    for _ in range(MOST_TIMES):
+        for k in range(ASSOCIATION_ROUNDS - 1):
+            fewer, state, associations = _associated(fewer, state, k, associations)
+            shares.append(_share_on_planes(fewer.association))
+            state = first_pass(fewer, state)
+        if shares[-1] > MIN_LAST_SHARE:
+            break
     before = [
         _unthinned(a, streams, first, step)
         for a, streams, first in zip(associations, recordings, _first_points(recordings), strict=True)
@@ -330,6 +334,9 @@ MOST_TRACED = 20_000  # points whose beams are traced: a share of 1 % has a stan
 # Points of all rounds but the last, at most: with 2 million the result moves by 0.05 sigma, at twice the time.
 MOST_EARLY_POINTS = 500_000
 ASSOCIATION_ROUNDS = 4
+# Times that all rounds but the last run, at most, while few points lie on planes. A guess that was 8 deg off about each
+# axis was still 2.5 deg off after the first time, and points were on wrong planes.
+MOST_TIMES = 2
 # Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
 STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
 MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncertain to be of use
