@@ -88,7 +88,7 @@ def errors(r, state, k=0):
     R, p, offset = parts
     turn, way, late = r.errors(ExtrinsicsGuess(R, p, float(offset[0])), k)
     print(turn, way, late)
-    return np.abs(turn).max(), np.abs(way).max(), abs(late)
+    return np.abs(turn).max(), np.abs(way), abs(late)
 
 
 def faces_of(found, streams):
@@ -113,7 +113,7 @@ def test_rounds_lead_to_the_truth(two_lidars):
     r, state, _ = two_lidars
     for k in range(2):
         turn, way, late = errors(r, state, k)
-        assert turn < 0.05 and way < 0.008 and late < 2e-4
+        assert turn < 0.05 and way.max() < 0.008 and late < 2e-4
 
 
 def test_hardly_a_point_is_on_a_wrong_plane(two_lidars):
@@ -174,13 +174,19 @@ def test_one_wall_is_one_plane(free_robot):
 @pytest.mark.full
 @pytest.mark.parametrize(
     ("example", "turn", "way", "late", "wrong"),
-    [("table2-3d", 0.02, 3e-3, 1e-4, 0.005), ("table2-ramp", 0.1, 5e-3, 3e-4, 0.01)],
+    [
+        ("table2-3d", 0.02, 3e-3, 1e-4, 0.005),
+        # Hills hardly show heights: with known planes, standard deviations are 0.4 to 0.8 mm, but of z 1.6 to 2.2 mm,
+        # and errors of z in 20 other recordings 1.04 times as large.
+        ("table2-ramp", 0.1, [3e-3, 3e-3, 8e-3], 3e-4, 0.01),
+    ],
 )
 def test_many_recordings(robot, example, turn, way, late, wrong):
     for seed in range(10):
         r = robot(40.0, seed, {"azimuth_steps": 1800}, example=example)
         state, found = calibrated(r)
-        assert (np.array(errors(r, state)) < [turn, way, late]).all()
+        turned, off, delay = errors(r, state)
+        assert turned < turn and (off < way).all() and delay < late
         table = faces_of(found[-1], r.streams)
         assert table.max(axis=1).sum() > (1.0 - wrong) * table.sum()
 

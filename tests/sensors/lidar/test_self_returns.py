@@ -106,7 +106,10 @@ def test_what_is_said_and_what_stays(robot):
     before, (said,) = found.warnings[0], found.warnings[1:]
     assert before == "before." and said.name == "self_returns_removed" and said.startswith("lidar0 ")
     assert "% of its points" in said and "0.86 to 1.3" in said
-    assert any(f"azimuth {deg} deg" in said for deg in (-1, 0, 1)) and "set min_range of lidar0 to 1.5 in the rig file" in said
+    assert (
+        any(f"azimuth {deg} deg" in said for deg in (-1, 0, 1))
+        and "set min_range of lidar0 to 1.5 in the rig file" in said
+    )
     (kept,) = found.lidars
     assert len(kept.stamps_ns) == len(stream.stamps_ns)
     assert len(kept.xyz) == pytest.approx((~hit).sum(), rel=0.01)
