@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from icalib.estimate.jacobian_noise import Spurious
-from icalib.observability.determination import _are_alike, _principal_directions, error_covariance
+from icalib.observability.determination import _are_alike, _joined, _principal_directions, error_covariance
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
@@ -94,3 +94,12 @@ def test_the_covariance_is_that_of_a_regression_with_noisy_regressors():
     said, formal = error_covariance(known, noise, NOTHING), np.linalg.inv(known + noise)
     np.testing.assert_allclose(np.cov(np.array(found).T), said, rtol=0.12)
     assert (np.diag(said) > 2.0 * np.diag(formal)).all()
+
+
+def test_of_two_null_spaces_all_is_fixed_that_is_not_in_both():
+    """A search that would cycle between them ended with a direction free of which the data know nothing."""
+    axes, a = np.eye(5), np.deg2rad(20.0)
+    other = np.column_stack([np.cos(a) * axes[0] + np.sin(a) * axes[3], axes[2]])
+    both = _joined(axes[:, :2], other)
+    np.testing.assert_allclose(both @ both.T, np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), atol=1e-12)
+    np.testing.assert_array_equal(_joined(axes[:, :2], other[:, :1]), axes[:, :2])

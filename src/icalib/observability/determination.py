@@ -175,7 +175,8 @@ class _NullSpaceSearch:
 
     def find_null_space(self) -> None:
         """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
-        but not in the last estimate. LATE rounds and later accept more fixed directions, see `_is_same_null_space`."""
+        but not in the last estimate. From round LATE on nothing is freed again, and more fixed directions are accepted,
+        see `_is_same_null_space`. Otherwise the search might cycle, and end with an unobservable direction free."""
         for k in range(MOST_ROUNDS):
             last, null_space = self.estimate, self.directions.unobservable
             unchanged = _is_same_null_space(null_space, last.problem.fixed_directions, k >= LATE)
@@ -183,6 +184,8 @@ class _NullSpaceSearch:
                 return
             keeps_fixed = unchanged and last.problem.fixed_directions.size
             fixed_directions = last.problem.fixed_directions if keeps_fixed else null_space
+            if k >= LATE and not keeps_fixed:
+                fixed_directions = _joined(last.problem.fixed_directions, null_space)
             # A failed estimate is no start for the next one.
             state = last.outcome.state if _is_usable(last.outcome) else self.start
             reset = self._directions_to_reset(last.problem, state, fixed_directions)
@@ -258,6 +261,15 @@ def _is_usable(outcome: Outcome) -> bool:
 def _maybe_rank_deficient(problem: Problem, information: np.ndarray) -> bool:
     """Whether the information, noise in the Jacobian included, may be rank deficient."""
     return essential_information(information, problem.tolerance, problem.layout) < RANK_DEFICIENT_BELOW
+
+
+def _joined(fixed_directions: np.ndarray, null_space: np.ndarray) -> np.ndarray:
+    """(B, k) orthonormal: the directions `fixed_directions` (B, m), and those of `null_space` (B, n) that do not count
+    as inside them. Both are orthonormal."""
+    if not fixed_directions.size:
+        return null_space
+    outside, sines, _ = np.linalg.svd(null_space - fixed_directions @ (fixed_directions.T @ null_space), False)
+    return np.hstack([fixed_directions, outside[:, sines**2 >= 1.0 - ALIKE**2]])
 
 
 def _is_same_null_space(null_space: np.ndarray, fixed_directions: np.ndarray, late: bool) -> bool:
