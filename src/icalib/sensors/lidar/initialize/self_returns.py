@@ -100,7 +100,7 @@ def _robot_voxels(stream: LidarStream, near: _NearPoints) -> np.ndarray | None:
     if len(groups) < MIN_GROUPS:
         return None
     occupied = near.occupied(groups)
-    return _dilated(_seen_through(_Views.of(stream, trajectory.only(trajectory.ok), near, groups), occupied))
+    return _dilated(_seen_through(_BeamViews.of(stream, trajectory.only(trajectory.ok), near, groups), occupied))
 
 
 @dataclass(frozen=True)
@@ -194,7 +194,7 @@ def _moving_groups(trajectory: SensorTrajectory, at: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Views:
+class _BeamViews:
     """Beams and near places of some groups of scans. pose: of the LiDAR at the groups (V,); beams: for each, points of
     its middle scan in the frame of that pose (n, 3) m; place (m, 3) m: points in the map, one in each voxel and group,
     and their voxel (m,)."""
@@ -205,7 +205,7 @@ class _Views:
     voxel: np.ndarray
 
     @classmethod
-    def of(cls, stream: LidarStream, path: SensorTrajectory, near: _NearPoints, groups: np.ndarray) -> _Views:
+    def of(cls, stream: LidarStream, path: SensorTrajectory, near: _NearPoints, groups: np.ndarray) -> _BeamViews:
         """At most MAX_VIEWS of `groups` (g,), on the known path of the LiDAR."""
         groups = groups[np.unique(np.linspace(0, len(groups) - 1, MAX_VIEWS).astype(int))]
         scan = near.first[groups] + SCANS_PER_GROUP // 2
@@ -228,7 +228,7 @@ def _in_map(stream: LidarStream, path: SensorTrajectory, point: np.ndarray) -> n
     return position + Slerp(path.seconds, Rotation.from_matrix(path.rotation))(t).apply(stream.xyz[point])
 
 
-def _seen_through(views: _Views, occupied: np.ndarray) -> np.ndarray:
+def _seen_through(views: _BeamViews, occupied: np.ndarray) -> np.ndarray:
     """(N_ROBOT_VOXELS,) bool: the voxel is occupied, and beams pass through the places where it was."""
     through, ends, covered = np.zeros(N_ROBOT_VOXELS), np.zeros(N_ROBOT_VOXELS), _dilated(occupied)
     some = occupied[views.voxel]
