@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from icalib.errors import EstimationError, RecordingError
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import Problem
 from icalib.estimate.solver import Visit
-from icalib.initialize.rig_guess import attempt
+from icalib.initialize.rig_guess import Attempt, attempt, solved, with_effects
 from icalib.kinds import readers
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
@@ -157,14 +159,19 @@ def _calibrate(
         if on_visit is not None:
             on_visit(visited(inputs, stage, problem, visit))
 
-    best_attempt = attempt(rig, recordings, clock.lap, lambda name, step: steps.note(name), report_visit)
-    if best_attempt.error is not None:
-        raise EstimationError(
-            " Besides, ".join(stated_words(best_attempt.inputs, c) for c in best_attempt.against)
-        ) from best_attempt.error
-    clock.lap("solving")
+    solve = partial(solved, on_step=lambda name, step: steps.note(name), on_visit=report_visit)
+
+    def make(rig: Rig) -> Attempt:
+        best_attempt = attempt(rig, recordings, clock.lap, solve)
+        if best_attempt.error is not None:
+            raise EstimationError(
+                " Besides, ".join(stated_words(best_attempt.inputs, c) for c in best_attempt.against)
+            ) from best_attempt.error
+        clock.lap("solving")
+        return best_attempt
+
+    best_attempt, result = _assessed(rig, make)
     progress("assessing the result", 0.9)
-    result = assess(best_attempt.inputs, best_attempt.solution, best_attempt.against)
     _refuse_no_numbers(result, rig)
     lidars = [s.name for s in rig.sensors.values() if s.shows_planes]
     if best_attempt.inputs.association.at_rest:  # of a recording that goes on between the stops only these
@@ -172,6 +179,17 @@ def _calibrate(
     result = dataclasses.replace(result, pictures=tuple(pictures(result, lidars, recordings)))
     clock.lap("judging")
     return dataclasses.replace(result, timings=clock.laps, made=datetime.now(UTC).isoformat(timespec="seconds"))
+
+
+def _assessed(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, Calibration]:
+    """The attempt and its result. If the recording shows effects that the rig lacks, those of the rig with them."""
+    first = make(rig)
+    result, effects = assess(first.inputs, first.solution, first.against)
+    if effects:
+        with suppress(EstimationError):
+            second = _assessed(with_effects(rig, effects), make)
+            return second if second[0].converged else (first, result)
+    return first, result
 
 
 def _refuse_no_numbers(result: Calibration, rig: Rig) -> None:
@@ -202,7 +220,7 @@ class _Clock:
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()
-        self.laps[name] = now - self._last
+        self.laps[name] = self.laps.get(name, 0.0) + now - self._last
         self._last = now
 
 

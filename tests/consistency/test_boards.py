@@ -349,15 +349,12 @@ CASES: dict[str, Case] = {
     ),
     # The first reason is the true one.
     "nothing is wrong": Case(BY_HAND, [has_no_reason, known()], lens("fixed")),
-    "a clock is 300 ppm fast": Case(
-        drifting(-300.0), [reason("clock_drifts", r"of cam0 .* about (2[6-9]|3[0-4])\d ppm fast")], lens("fixed")
-    ),
     # Neither camera drifts against the other, both against the IMU.
     "a clock that two cameras share is 300 ppm fast": Case(
-        drifting(-300.0, 2), [reason("clock_drifts", r"of cam0 and cam1 .* about 3\d\d ppm fast")], lens("fixed")
+        drifting(-300.0, 2), [drifts_by(-300.0, "cam0", "cam1"), known()], lens("fixed")
     ),
     # Stamps that run fast need an offset that falls.
-    "a clock is 300 ppm fast, rates are free": Case(drifting(-300.0), [drifts_by(-300.0, "cam0"), known()], rates_free),
+    "a clock is 300 ppm fast": Case(drifting(-300.0), [drifts_by(-300.0, "cam0"), known()], lens("fixed")),
     "a clock is 100 ppm slow, rates are free": Case(
         drifting(100.0), [drifts_by(100.0, "cam0"), known()], rates_free, full=True
     ),

@@ -55,12 +55,34 @@ def rates_within(ppm: float, *sensors: str) -> Check:
     return check
 
 
+def with_segments(simulation: Simulation) -> Rig:
+    rig = rig_for(simulation.scenario)
+    return replace(rig, settings=replace(rig.settings, segments=8))
+
+
+def no_rates(run: Run) -> None:
+    assert all(g.mode == "fixed" for g in run.result.groups if g.name == "clock_rate")
+
+
 CASES: dict[str, Case] = {
     "camera, LiDAR and wheels": Case(
         lambda: simulate(drifting(make_robot("3d", 20.0, "clw")), 0),
         [known(), rates_within(19.0, "cam0", "lidar0", "wheel0")],
         rates_free,
         planes_found,
+    ),
+    "poses, whose rate the recording shows": Case(
+        lambda: simulate(drifting(by_hand(POSES)), 1), [known(), rates_within(10.0, "mocap0")]
+    ),
+    "camera, LiDAR and wheels, whose rates the recording shows": Case(
+        lambda: simulate(drifting(make_robot("3d", 20.0, "clw")), 0),
+        [known(), rates_within(19.0, "cam0", "lidar0", "wheel0")],
+        with_segments,
+        planes_found,
+        full=True,
+    ),
+    "no clock drifts": Case(
+        lambda: simulate(make_robot("3d", 20.0, "clw"), 0), [known(), no_rates], with_segments, planes_found, full=True
     ),
     "poses": Case(lambda: simulate(drifting(by_hand(POSES)), 1), [known(), rates_within(10.0, "mocap0")], rates_free),
     "positions": Case(

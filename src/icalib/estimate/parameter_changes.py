@@ -60,6 +60,11 @@ class Change:
     count: int
     rival: float = 0.0
 
+    @property
+    def is_clock_drift(self) -> bool:
+        """Whether it is the rate of a clock, which an estimate can include."""
+        return self.name == TIME_OFFSET.name and self.pattern == "drift"
+
 
 @dataclass(frozen=True)
 class Scatter:

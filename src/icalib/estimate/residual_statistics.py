@@ -184,6 +184,16 @@ class Segments:
 
         return self.problem.marginal(piece_between)
 
+    @property
+    def known(self) -> np.ndarray:
+        """(G, B, B) information of each segment, with an equal share of what only the joint trajectory adds."""
+        alone = self.sums[:, :-1, :-1]
+        return alone + (self.information - alone.sum(axis=0)) / self.count
+
+    def after(self, step: np.ndarray) -> Segments:
+        """The segments with the gradients that the linear step (B,) leaves."""
+        return replace(self, gradients=self.gradients + self.known @ step)
+
     def cost(self, g: int, state: State, out: Residuals) -> float:
         """Half the robust chi^2 of segment `g` at `state`; fills `out` with its residuals."""
         piece = Piece.bare(int(self.ends[g]), int(self.ends[g + 1]))
@@ -240,8 +250,7 @@ def split_expectation(outcome: Outcome, parts: Segments) -> np.ndarray:
     """
     t, n = parts.problem.tolerance, parts.count
     inverse = restricted_inverse(outcome.information * t[:, None] * t, parts.problem.fixed_directions)
-    segment_information = parts.sums[:, :-1, :-1]
-    known = (segment_information + (parts.information - segment_information.sum(axis=0)) / n) * t[:, None] * t
+    known = parts.known * t[:, None] * t
     left = (known - known @ inverse @ known).sum(axis=0)
     return t**2 * n / (n - 1.0) * np.diag(inverse @ left @ inverse)
 

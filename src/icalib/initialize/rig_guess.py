@@ -37,6 +37,7 @@ from icalib.initialize.initializer import (
 )
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
+from icalib.observability.prior_sensitivity import Effect
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.memory import trim_heap
 from icalib.optim.state import State
@@ -183,21 +184,17 @@ class Attempt:
         return max((np.sqrt(chi2 / max(n, 1)) for n, chi2 in statistics), default=0.0) if outcome.converged else np.inf
 
 
-def attempt(
-    rig: Rig,
-    recordings: Sequence[Measurements],
-    lap: Callable[[str], None],
-    on_step: Callable[[str, Step], None],
-    on_visit: OnVisit,
-) -> Attempt:
+Solve = Callable[[Inputs, State, Values], Attempt]
+
+
+def attempt(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], None], solve: Solve) -> Attempt:
     """The estimate of `rig`, or a fallback. An estimate without guesses replaces one that fails or fits poorly, if it
     fits clearly better. Otherwise the first estimate is returned, with the stated values that contradict the data. If
     it failed, the estimate without any stated values takes its place.
 
-    lap, on_step, on_visit: progress of stages and solver. Raises EstimationError if the data do not determine an
-    estimate.
+    lap: called at the end of each stage. solve: `solved`, with progress of the solver. Raises EstimationError if the
+    data do not determine an estimate.
     """
-    solve = partial(_solved, on_step=on_step, on_visit=on_visit)
 
     def make(rig: Rig) -> Attempt:
         return solve(*guess_of_rig(rig, recordings, lap))
@@ -224,6 +221,12 @@ def attempt(
     return first
 
 
+def with_effects(rig: Rig, effects: Sequence[Effect]) -> Rig:
+    """The rig with priors on `effects`, so that they are estimated."""
+    priors = {(e.sensor, e.spec.name): Parameter("prior", np.zeros(1), np.full(1, e.prior_sigma)) for e in effects}
+    return with_groups(rig, lambda sensor, name, p: priors.get((sensor.name, name), p))
+
+
 def _attempt_or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:
     """The attempt, or the error why it failed. Raises FarOffError."""
     try:
@@ -244,7 +247,7 @@ def explained_failure(
     return motion_kinds(rig)[0].explained(estimate) or failed
 
 
-def _solved(
+def solved(
     inputs: Inputs, state: State, guess: Values, on_step: Callable[[str, Step], None], on_visit: OnVisit
 ) -> Attempt:
     """The estimate from an `InitialGuess`. Raises EstimationError."""
@@ -259,7 +262,7 @@ def _solved(
     return Attempt(inputs, solution)
 
 
-def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt], solve: Callable[..., Attempt]) -> Attempt | None:
+def _without_guesses(rig: Rig, make: Callable[[Rig], Attempt], solve: Solve) -> Attempt | None:
     """The estimate without guesses. If parameters are unobservable then, `solve` repeats it from its own state, with
     these parameters reset to the guesses that agree with it. None if the rig has no guesses, or the estimate fails."""
     fallback = _without_values(rig, make, lambda p: p.mode == "free") if _has_values(rig, "free") else None

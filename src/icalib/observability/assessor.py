@@ -13,7 +13,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Segments
 from icalib.kinds import assessors
-from icalib.observability.prior_sensitivity import Relaxed
+from icalib.observability.prior_sensitivity import Effect, Relaxed
 from icalib.optim.state import Key, State
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Plane, Timeline
@@ -29,12 +29,13 @@ Remarks = Iterable[Remark]
 class Cause:
     """A possible cause. sentence: the fault, and what to do about it; gain: the decrease of chi^2 if it is modelled;
     grave: whether the result must not be used; explains: parameter groups whose stated values contradict the data for
-    this cause, so that the contradiction needs no other sentence."""
+    this cause, so that the contradiction needs no other sentence; effect: of the whole recording, that models it."""
 
     sentence: Remark
     gain: float
     grave: bool = False
     explains: tuple[Key, ...] = ()
+    effect: Effect | None = None
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ from scipy.linalg import eigh
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, with_association, with_groups
-from icalib.estimate.problem import Problem, given_priors, guess_sigma
+from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma
+from icalib.estimate.residual_statistics import Segments, noise_variance, spread_variance
 from icalib.estimate.solver import Linearised, Outcome, outcome_of
 from icalib.geometry import planes, so3
 from icalib.motion.factor import Residuals
@@ -34,7 +35,7 @@ from icalib.optim.arrowhead import (
     sums_of_priors,
 )
 from icalib.optim.state import Block, Key, Layout, State
-from icalib.rig import Parameter, Sensor
+from icalib.rig import Parameter, ParameterSpec, Sensor
 from icalib.sensors.sensor import ROTATION
 
 # information in tolerance units, noise in the Jacobian included; below it a direction is reset to the guess
@@ -293,16 +294,28 @@ def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
     if not estimate.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
         return None
     freed = freed_inputs(inputs)
-    fixed_directions = _in_layout(freed.layout, inputs.layout, estimate.problem.fixed_directions)
-    state = estimate.outcome.state
+    if (linearised := _linearised(freed, estimate)) is None:
+        return None
+    problem, state, solution, residuals = linearised
+    return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))
+
+
+def _linearised(
+    inputs: Inputs, estimate: Estimate, effects: Collection[Key] = ()
+) -> tuple[Problem, State, Solution, Residuals] | None:
+    """Normal equations at the solution of `estimate` for `inputs` with more free groups; None if they are singular.
+    Priors on `effects` are so wide that they have no weight."""
+    fixed_directions = _in_layout(inputs.layout, estimate.problem.layout, estimate.problem.fixed_directions)
+    state = begun(inputs, estimate.outcome.state)
     try:
-        problem = estimate.measurement_model.problem(freed, state, fixed_directions)
+        problem = estimate.measurement_model.problem(inputs, state, fixed_directions)
+        priors = (replace(p, sigma=WIDE * p.sigma) if p.block.key in effects else p for p in problem.priors)
+        problem = replace(problem, priors=tuple(priors))
         pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
-        solution = problem.solve(pieces)
+        return problem, state, problem.solve(pieces), residuals
     except EstimationError:
         return None
-    return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))
 
 
 def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
@@ -348,3 +361,55 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
     for block in before.free:
         out[layout.block(*block.key).columns] = fixed_directions[block.columns]
     return out
+
+
+# Effects that the estimate leaves out: parameters that are zero, and not estimated, by default.
+
+
+WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect of the whole recording, such as the rate of a clock, by a score test. value: one Newton step of its
+    parameter [the unit of `spec`], beside all other effects that were tested; std: its standard deviation, by the
+    scatter of segments after this step."""
+
+    sensor: str
+    spec: ParameterSpec
+    value: float
+    std: float
+
+    @property
+    def gain(self) -> float:
+        """Decrease of chi^2 where it is estimated."""
+        return (self.value / self.std) ** 2
+
+    @property
+    def prior_sigma(self) -> float:
+        """Standard deviation of the prior with which it is estimated: the next power of ten, or the usual one."""
+        return max(float(10.0 ** np.ceil(np.log10(abs(self.value)))), self.spec.prior_sigma)
+
+
+def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
+    """All effects that the rig file does not mention, tested together; none without convergence."""
+    tested = {
+        (s.name, spec.name): spec
+        for s in inputs.rig.mounted
+        for spec in s.specs()
+        if spec.is_effect and (p := getattr(s, spec.name)).mode == "fixed" and p.value is None
+    }
+    rig = with_groups(inputs.rig, lambda s, name, p: Parameter() if (s.name, name) in tested else p)
+    freed = with_association(replace(inputs, rig=rig), inputs.association)
+    columns = {key: freed.layout.columns(*key)[0] for key in tested if freed.layout.is_free(*key)}
+    if not (columns and estimate.outcome.converged) or (linearised := _linearised(freed, estimate, tested)) is None:
+        return ()
+    problem, state, solution, residuals = linearised
+    t = problem.tolerance
+    root = restricted_root(t[:, None] * solution.information * t, problem.fixed_directions)
+    step, variance = -t * (root @ (root.T @ (t * solution.gradient[:-1]))), t**2 * (root**2).sum(axis=1)
+    outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
+    if (parts := Segments.of(problem, outcome, inputs.rig.settings.segments)) is not None:
+        variance = np.maximum(variance, spread_variance(outcome, parts.after(step), noise_variance(problem, outcome)))
+    std = np.sqrt(variance)
+    return tuple(Effect(key[0], tested[key], float(step[k]), float(std[k])) for key, k in columns.items())

@@ -64,6 +64,7 @@ CLOCK_RATE = ParameterSpec(
     tolerance=10.0,
     prior_sigma=50.0,
     is_auxiliary=True,
+    is_effect=True,
     meaning="how much more time passes on the clock of the reference",
     motion="record longer",
 )

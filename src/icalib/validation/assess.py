@@ -31,6 +31,7 @@ from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
+from icalib.observability.prior_sensitivity import Effect
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
@@ -55,9 +56,12 @@ from icalib.validation.causes import all_causes, pace_words, scatter_warnings
 from icalib.validation.guesses import guess_notes
 
 
-def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()) -> Calibration:
-    """The result of the estimate `determined`. against: values of the rig file that the data contradict so strongly
-    that other faults of the estimate may follow from them."""
+def assess(
+    inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()
+) -> tuple[Calibration, tuple[Effect, ...]]:
+    """The result of the estimate `determined`, and the effects that the recording shows and the estimate lacks.
+    against: values of the rig file that the data contradict so strongly that other faults of the estimate may follow
+    from them."""
     estimate, rig = determined.estimate, inputs.rig
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
     contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
@@ -79,13 +83,14 @@ def assess(inputs: Inputs, determined: Determined, against: Sequence[Contradicti
         *_warnings(assessed),
         *scatter_warnings(factors, segments is not None, validation),
     )
-    return dataclasses.replace(
+    result = dataclasses.replace(
         _calibration(assessed, determined, observability),
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*_notes(assessed), *size_notes, *few_segments_notes(inputs, segments)),
         cross_validation=validation,
         wrong=grave,
     )
+    return result, tuple(c.effect for c in causes if c.effect is not None)
 
 
 def _calibration(assessed: AssessedEstimate, determined: Determined, observability: Observability) -> Calibration:
@@ -345,7 +350,8 @@ CLOCK_RATE_SIGMAS = 5.0  # standard deviations from which a clock rate is named
 def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
     """A note on each clock whose rate differs from that of the body, by more than the time tolerance over the
     recording."""
-    rig, duration = assessed.inputs.rig, float(np.ptp(assessed.estimate.outcome.state.seconds))
+    rig = assessed.inputs.user_rig or assessed.inputs.rig
+    duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
     for g in assessed.groups:
         rate, std = (float(x[0]) for x in (g.value, g.std)) if g.name == CLOCK_RATE.name else (0.0, 0.0)
         drift_s = PPM * abs(rate) * duration

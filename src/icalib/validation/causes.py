@@ -11,13 +11,14 @@ from icalib.base.remark import Remark
 from icalib.data.measurements import ImuStream
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
-from icalib.estimate.parameter_changes import Change, changes, scatter
+from icalib.estimate.parameter_changes import Change, Scatter, changes, scatter
 from icalib.estimate.residual_statistics import Segments, rows_of
 from icalib.kinds import assessors
 from icalib.motion.factor import FitKey
+from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Cause, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
-from icalib.observability.prior_sensitivity import Relaxed, relaxed
+from icalib.observability.prior_sensitivity import Relaxed, effects_left_out, relaxed
 from icalib.optim.state import Key
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
@@ -181,27 +182,62 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool)
     for assessment in assessments(assessed):
         yield from assessment.clock_causes
     causes, segments, timeline = list[Cause](), assessed.segments, assessed.timeline
+    by_gain = () if segments is None else changes(segments, assessed.inputs.sensors)
+    clear = None if segments is None else _clear_change(by_gain, scatter(segments))
+    if effects := list(effect_causes(assessed, by_gain, clear)):  # the others may follow from these
+        yield from effects
+        return
     if misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
-    if segments is not None and (misfit.fits or scattering):
-        causes += _change(assessed.inputs, segments, misfit, timeline)
+    if segments is not None and clear is not None and (misfit.fits or scattering):
+        causes += _change(by_gain, segments, misfit, timeline)
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
 
 
-def _change(inputs: Inputs, segments: Segments, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
-    """The change that explains clearly more than all others, if there is one. Two that explain as much are named
-    together if they are the same change, seen from either sensor, or changes of one sensor."""
-    by_gain, spread = changes(segments, inputs.sensors), scatter(segments)
+EFFECT_SIGMAS = 5.0  # standard deviations from which an effect is estimated
+
+
+def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: Change | None) -> Iterator[Cause]:
+    """A cause for each effect that differs from zero, with standard deviations that include the scatter of segments; or
+    that is the `clear` change, as one step leaves scatter where it is large. by_gain: all changes; a clock that jumps
+    does not drift."""
+    jumping = {c.sensors for c in by_gain if c.name == TIME_OFFSET.name and not c.is_clock_drift}
+    drifting = clear.sensors if clear is not None and clear.is_clock_drift else ()
+    rig = assessed.inputs.user_rig or assessed.inputs.rig
+    duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
+    for e in effects_left_out(assessed.inputs, assessed.estimate):
+        differs = abs(e.value) > EFFECT_SIGMAS * e.std or e.sensor in drifting
+        if differs and (e.sensor,) not in jumping:
+            late_s = PPM * abs(e.value) * duration
+            sentence = (
+                f"the clock of {e.sensor} runs about {pace_words(e.value)} against that of {rig.reference}, "
+                f"{1e3 * late_s:.2g} ms over the recording. Write clock_rate: {{prior: 0, sigma: "
+                f"{e.prior_sigma:.0f}}}, and leave time_offset free; or stamp all sensors by one clock, and "
+                "record again."
+            )
+            grave = late_s > LARGE * rig.settings.time_tolerance_s
+            yield Cause(Remark("clock_drifts", sentence), e.gain, grave, effect=e)
+
+
+def _clear_change(by_gain: Sequence[Change], spread: Scatter) -> Change | None:
+    """The first of the changes, if it explains clearly more than all others."""
     if not by_gain or by_gain[0].gain < MIN_CHANGE_SHARE * spread.beyond_chance or not spread.exceeded_by(by_gain[0]):
-        return
+        return None
+    return by_gain[0]
+
+
+def _change(by_gain: Sequence[Change], segments: Segments, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
+    """The clear change. Two that explain as much are named together if they are the same change, seen from either
+    sensor, or changes of one sensor. A clock that drifts is an effect, and none of these."""
     best = by_gain[0]
     alike = [c for c in by_gain if c.gain > ALIKE * best.gain]
     kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
-    if best.pattern != "pulse" and all((c.name, c.pattern) in kinds_of_best for c in alike):
+    if best.pattern != "pulse" and not best.is_clock_drift and all((c.name, c.pattern) in kinds_of_best for c in alike):
         words = _change_words(alike, segments, timeline)
-        share = f" This explains {min(best.gain / spread.beyond_chance, 1.0):.0%} of what varies over the recording."
-        yield Cause(words.with_sentence(words + share), best.gain, misfit.is_grave or _is_large(best, segments))
+        share = min(best.gain / scatter(segments).beyond_chance, 1.0)
+        words = words.with_sentence(f"{words} This explains {share:.0%} of what varies over the recording.")
+        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, segments))
 
 
 def _is_large(c: Change, segments: Segments) -> bool:
@@ -248,17 +284,8 @@ def _changed(c: Change, segments: Segments) -> tuple[Remark, str]:
 
 
 def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> Remark:
-    """A sentence on a time offset that drifts or jumps. others: clocks that explain as much."""
+    """A sentence on a time offset that jumps. others: clocks that explain as much."""
     instead = f" (or that of {', or of '.join(others)} the opposite way)" if others else ""
-    if c.pattern == "drift":
-        rate = 1e6 * float(c.value[0]) / float(np.ptp(segments.state.seconds[segments.ends]))
-        wider = 10.0 ** np.ceil(np.log10(abs(rate)))
-        return Remark(
-            "clock_drifts",
-            f"the clock of {_names(c)}{instead} runs about {pace_words(rate)} against the others, "
-            f"{1e3 * abs(c.value[0]):.2g} ms {when}. Write clock_rate: {{prior: 0, sigma: {wider:.0f}}}, and leave "
-            "time_offset free; or stamp all sensors by one clock, and record again.",
-        )
     return Remark(
         "clock_jumps",
         f"the time offset of {_names(c)}{instead} changes by about {1e3 * c.value[0]:+.2g} ms {when}: its clock "
