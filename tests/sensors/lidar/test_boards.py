@@ -99,6 +99,14 @@ def test_rings_cross_the_edges_half_a_step_beyond_the_last_beam():
         assert (np.abs(off) < 0.5 * edges[:, 4] + 1e-3).all() and np.abs(off).max() > 0.3 * edges[:, 4].max()
 
 
+def test_white_noise_of_ranges_does_not_correlate_at_a_stop():
+    """Points of oblique beams are moved along the sheet by their noise; this must not look like a tilt."""
+    stops = Stops(8, rings=64)
+    result = calibrate_measurements(stops.rig(), simulate_stops(stops, 4)[0])
+    (fit,) = (f for f in result.fits if f.kind == "points on boards")
+    assert 1.3**-2 < fit.chi2 / fit.dof < 1.1
+
+
 def errors(stops: Stops, seed: int, sheet: tuple[float, float] = (0.7, 0.85)):
     """Errors (6,) of rotation [rad] and translation [m], and their covariance (6, 6). sheet: as the rig file has it."""
     measured, _ = simulate_stops(stops, seed)

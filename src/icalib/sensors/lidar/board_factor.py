@@ -430,12 +430,15 @@ class BoardFactor(RowFactor):
             variance[one] = step[one] ** 2 / 12.0 * np.maximum(shared, 1.0)
         return 0.5 * np.sqrt(variance.sum(axis=1))
 
-    def noise_sizes(self, out: Whitened) -> tuple[float, float]:
+    def noise_sizes(self, out: Whitened, spent: float) -> tuple[float, float]:
         """Standard deviation of residuals about what fits those of each stop best, an offset and two tilts, in m or
         for rings in units of their rounding; and how many times larger it is in these offsets and tilts. This is above
-        1 if errors of one stop correlate."""
+        1 if errors of one stop correlate. spent: degrees of freedom of the residuals that the estimate takes up. These
+        are of offsets and tilts, which alone poses of the target move (REML; Patterson and Thompson 1971)."""
         raw = out.residual[:, 0] * (self.noise.edge_scale if self.kind == ON_EDGES else self.sigma)
         root, xyz = out.root[:, 0], self.points.xyz[:: self.points_per_row]
+        if self.kind == ON_BOARDS:  # where beams meet the sheet: noise moves points of oblique beams along it
+            xyz = xyz * (1.0 - raw / np.linalg.norm(xyz, axis=1))[:, None]
         squares, planes, n = np.zeros(2), 0, 0
         scan = self.points.scan[:: self.points_per_row]
         for stop in np.split(np.arange(len(raw)), np.flatnonzero(np.diff(scan)) + 1):
@@ -447,7 +450,7 @@ class BoardFactor(RowFactor):
             squares += along @ along, weighted @ weighted - along @ along
             planes, n = planes + basis.shape[1], n + max(len(x) - basis.shape[1], 0)
         sigma = float(np.sqrt(squares[1] / max(n, 1)))
-        return sigma, max(1.0, float(np.sqrt(squares[0] / planes)) / max(sigma, 1e-9))
+        return sigma, max(1.0, float(np.sqrt(squares[0] / max(planes - spent, 1.0))) / max(sigma, 1e-9))
 
     @property
     def key(self) -> FactorKey:

@@ -10,7 +10,7 @@ import numpy as np
 
 from icalib.data.measurements import LidarStream, Measurements
 from icalib.model.sensor_model import Pass, PassEnd, SensorModel
-from icalib.motion.factor import Factor, Whitened, pairs_of
+from icalib.motion.factor import Factor, pairs_of
 from icalib.motion.point_planes import PlaneAssociation, thinned
 from icalib.optim.state import Key
 from icalib.rig import Lidar, ParameterSpec, Rig
@@ -68,7 +68,9 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
                 next_noise[sensor.name] = replace(noise[sensor.name], sigma=max(sigma, MIN_RANGE_SIGMA_M))
         for factor, out in pairs_of(end.factors, end.residuals, BoardFactor):
             sensor = next(s for s in sensors if s.name == factor.name)
-            next_noise[sensor.name] = _on_boards(sensor, next_noise[sensor.name], factor, out)
+            fit = end.of(sensor.name).fits[factor.kind]
+            sizes = factor.noise_sizes(out, fit.count - fit.dof)
+            next_noise[sensor.name] = _on_boards(sensor, next_noise[sensor.name], factor.kind, *sizes)
         for factor, _ in pairs_of(end.factors, end.residuals, PatchFactor):
             next_noise[factor.name] = replace(factor.noise, flatness=factor.measured_flatness(end.state))
         return next_noise
@@ -108,11 +110,10 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         return points_on_planes(at.motion, stream, np.where(plane < at.association.count, plane, -1))
 
 
-def _on_boards(sensor: Lidar, noise: LidarNoise, factor: BoardFactor, out: Whitened) -> LidarNoise:
-    """The noise with what the residuals `out` of one factor show: of rings, or of points unless the rig file states it,
-    and how far errors of the points at a stop correlate."""
-    sigma, inflation = factor.noise_sizes(out)
-    if factor.kind == ON_EDGES:
+def _on_boards(sensor: Lidar, noise: LidarNoise, kind: str, sigma: float, inflation: float) -> LidarNoise:
+    """The noise with what the residuals of one factor show, see `BoardFactor.noise_sizes`: of rings, or of points
+    unless the rig file states it, and how far errors of the points at a stop correlate."""
+    if kind == ON_EDGES:
         return replace(noise, edge_scale=max(inflation * sigma, 1.0))
     noise = replace(noise, inflation=inflation)
     return noise if sensor.range_noise_m is not None else replace(noise, sigma=max(sigma, MIN_RANGE_SIGMA_M))
