@@ -30,6 +30,7 @@ from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerNoise
 from icalib.sensors.camera.model import NO_BLOOM, restrict
+from icalib.sensors.camera.spec import Shutter
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import OnPlanes, Surfaces
 from icalib.sensors.camera.tracks import TrackNoise
@@ -47,6 +48,7 @@ TOLERANCE = {
     "translation": 5e-3,
     "time_offset": 1e-3,
     "clock_rate": 1e3,
+    "readout": 1e-3,
     "intrinsics": 1.0,
     "size_effect": 1e-3,
     "distortion": 1e-2,
@@ -233,10 +235,15 @@ def make_factor(setup: Setup, camera: int, scheme: Scheme = "inertial", **change
 
 
 def make_features(
-    setup: Setup, scheme: Scheme = "inertial", loss: tuple[str, float] = ("none", 2.5), noise_px: float = 0.0
+    setup: Setup,
+    scheme: Scheme = "inertial",
+    loss: tuple[str, float] = ("none", 2.5),
+    noise_px: float = 0.0,
+    shutter: Shutter | None = None,
 ) -> FeatureFactor:
     """The corners of both cameras as features of unknown position, sigma 0.8 and 1.1 px, that of the second camera
-    growing with the number of views; of every third image of the first camera some are not in use."""
+    growing with the number of views; of every third image of the first camera some are not in use. shutter: of the
+    first camera."""
     rng = np.random.default_rng(11)
     streams = tuple(
         TrackStream(s.name, s.stamps_ns, s.start, s.point, s.uv + noise_px * rng.normal(size=s.uv.shape))
@@ -245,6 +252,7 @@ def make_features(
     views = rng.integers(0, 20, len(streams[1].uv))
     streams = (streams[0], replace(streams[1], views=views))
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(streams)))
+    cameras = (replace(cameras[0], shutter=shutter), *cameras[1:])
     keep = [rng.random(len(s.uv)) < 0.9 for s in streams]
     cuts = tuple(p.first for p in make_pieces(len(setup.state.seconds), 0)[1:])
     noise = (TrackNoise(0.8), TrackNoise(1.1, 0.3))

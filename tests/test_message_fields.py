@@ -89,6 +89,8 @@ EXAMPLES = {
     "values": "gyro: 0.001, gyro_walk: 1e-05, accel: 0.01, accel_walk: 0.0001",
     "source": "kalibr",
     "wider": "1000",
+    "e.prior_sigma": "50",
+    "s.rolling": "rows",
     "'relative' if _drifts(topic) and (not leads) else 'absolute'": "relative",
 }
 # Words that the user replaces by names, numbers or a list.

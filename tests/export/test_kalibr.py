@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from icalib.errors import CalibrationError
 from icalib.export.kalibr import camchain, imu_yaml
+from icalib.export.odometry import openvins
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_data import correction_matrices
 from icalib.result import Calibration, ParameterGroup, by_key
@@ -185,3 +186,23 @@ def test_imu_intrinsics_and_poses_are_those_of_kalibrs_frame(calibration: Calibr
 def test_unknown_rate_is_said(calibration: Calibration):
     with pytest.raises(CalibrationError, match="rate of imu0"):
         imu_yaml(dataclasses.replace(calibration, rates={}))
+
+
+@pytest.mark.parametrize(("rolling", "size"), [("rows", 480), ("columns", 752)])
+def test_a_rolling_shutter_has_a_line_delay(calibration: Calibration, rolling: str, size: int):
+    cam1 = calibration.rig["sensors"]["cam1"] | {"shutter": {"rolling": rolling, "readout": "free"}}
+    sensors = calibration.rig["sensors"] | {"cam1": cam1}
+    one, zero = np.array([0.024]), np.zeros(1)
+    group = ParameterGroup("cam1", "readout", ("readout",), "s", one, zero, zero, ("determined",), "free")
+    rolled = dataclasses.replace(
+        calibration, rig=calibration.rig | {"sensors": sensors}, groups=(*calibration.groups, group)
+    )
+    text = camchain(rolled)
+    assert yaml.safe_load(text)["cam1"]["line_delay"] == pytest.approx(0.024 / size)
+    assert "line_delay" not in yaml.safe_load(text)["cam0"]
+    said = f"# cam1 has a rolling shutter: each {rolling[:-1]} is exposed line_delay [s] after the one before; "
+    assert said + f"timeshift_cam_imu is that of the middle {rolling[:-1]}." in text
+    sentence = (
+        f"cam1 has a rolling shutter, read out in 24.000 ms: its time offset is that of the middle {rolling[:-1]}."
+    )
+    assert sentence in openvins(rolled).sentences

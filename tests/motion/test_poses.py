@@ -9,8 +9,8 @@ from tests.cases import each
 
 from icalib.geometry import so3
 from icalib.motion.poses import assign_keyframes, poses_and_velocity_derivatives, poses_at
-from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
-from icalib.optim.state import KEYFRAME_DIM
+from icalib.motion.sensor_pose import Kinematics, SensorPose, rate_slopes, rows_at, with_slopes
+from icalib.optim.state import KEYFRAME_DIM, State
 
 SCHEMES = ("inertial", "kinematic", "pose")
 
@@ -285,3 +285,20 @@ def test_in_the_middle_the_earlier_keyframe_is_taken_whatever_the_rounding(time,
 @each(("time", "keyframe"), [(-1.0, 0), (0.0, 0), (0.9, 0), (1.0, 1), (2.9, 1), (3.0, 1), (4.0, 1)])
 def test_pose_takes_the_keyframe_before_that_has_one_after(time, keyframe):
     assert assign_keyframes("pose", N_KEYFRAMES, np.array([time]))[0] == keyframe
+
+
+def test_slopes_are_the_change_of_a_rate_within_an_image():
+    """Angular acceleration about z and jerk along x of a sensor beside the body, from rest."""
+    slope, t, arm = np.array([0.0, 0.0, 3.0, 6.0, 0.0, 0.0]), np.array([-0.015, 0.0, 0.01]), np.array([0.2, 0.0, 0.0])
+    seconds = np.array([0.0, 0.05, 0.1, 0.15, 0.2])
+    nothing = np.zeros((5, 0))
+    state = State(seconds, nothing, nothing, nothing, -seconds[:, None] * slope, {})
+    slopes = rate_slopes(state)
+    np.testing.assert_allclose(slopes, np.tile(slope, (5, 1)), atol=1e-12)
+    still, eyes, none = np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)), np.zeros((0, 6, 15))
+    at = SensorPose(np.eye(3), arm, eyes, still + arm, still, still, none, none, np.zeros((3, 6, 0)), np.zeros(3))
+    moved = with_slopes(at, slopes[:3], t)
+    turn = so3.exp_many(np.outer(t**2 / 2.0, slope[:3]))
+    np.testing.assert_allclose(moved.rotation, turn, atol=1e-12)
+    np.testing.assert_allclose(moved.rate, np.outer(t, slope[:3]), atol=1e-12)
+    np.testing.assert_allclose(moved.position, turn @ arm + np.outer(t**3 / 6.0, slope[3:]), atol=1e-7)

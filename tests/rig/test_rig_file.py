@@ -325,6 +325,25 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
             "cornernoise: 0.2",
             "sensors.cam0.cornernoise: there is no such field, did you mean 'corner_noise'",
         ),
+        (
+            "corner_noise: 0.2",
+            "shutter: rolling",
+            "cam0.shutter: must be a mapping (name: value), but is 'rolling'",
+        ),
+        ("corner_noise: 0.2", "shutter: {readout: free}", "sensors.cam0.shutter: rolling is missing; add rolling"),
+        ("corner_noise: 0.2", "shutter: {rolling: row}", "shutter.rolling: there is no such choice as 'row', did you"),
+        (
+            "corner_noise: 0.2",
+            "shutter: {rolling: rows, line_delay: 1}",
+            "sensors.cam0.shutter.line_delay: there is no such field; available are rolling, readout",
+        ),
+        (
+            "corner_noise: 0.2",
+            "shutter: {rolling: rows, readout: {guess: 16.5}}",
+            "sensors.cam0.shutter.readout: is in seconds, and at most 0.5 s; correct it.",
+        ),
+        ("corner_noise: 0.2", "shutter: {rolling: rows, readout: 0.01}", "shutter.readout: must be free or a mapping"),
+        ("corner_noise: 0.2", "readout: free", "sensors.cam0.readout: there is no such field"),
         ("path: right/corners.csv.gz", "path: [a]", "sensors.cam1.path: must be text, but is a list"),
         (
             NOISE,
@@ -553,3 +572,15 @@ def test_the_body_is_a_sensor_of_the_rig(tmp_path: Path):
     with pytest.raises(CalibrationError, match=r"rig\.yaml:4: body: there is no sensor lidar1, did you mean 'lidar0'"):
         load(tmp_path, text.replace("body: lidar0", "body: lidar1"))
     assert "body" not in rig_to_dict(load(tmp_path, text.replace("body: lidar0\n", "")))
+
+
+@each(
+    "readout",
+    [Parameter(), Parameter("prior", np.array([0.016]), np.array([1e-3])), Parameter("fixed", -np.ones(1) / 50)],
+)
+def test_a_rolling_shutter_is_written_as_it_is_read(readout):
+    camera = Camera("cam0", "a.csv", "pinhole-radtan", (752, 480), rolling="columns", readout=readout)
+    rig = Rig(by_name(ImuSensor("imu0", "i.csv", class_noise("consumer")), camera), AprilGrid(6, 6, 0.088, 0.3))
+    (again,) = rig_from_dict(rig_to_dict(rig), "rig.yaml").cameras
+    assert again.shutter == (0, 752) and repr(again.readout) == repr(readout)
+    assert "shutter" not in dataclasses.replace(camera, rolling=None).plain()

@@ -443,7 +443,7 @@ def start_values(inputs: Inputs, guess_values: dict[Key, np.ndarray]) -> dict[Ke
         values[reference, SHEET_MIDDLE.name] = np.zeros(2)
     for sensor in rig.sensors.values():
         for spec in sensor.specs():
-            if spec.manifold == "nuisance" or spec.is_auxiliary:  # the guess has no bias, scale or shape
+            if spec.manifold == "nuisance" or spec.is_auxiliary or spec.starts_at_zero:  # none of these is guessed
                 stated = getattr(sensor, spec.name).value
                 values[sensor.name, spec.name] = np.zeros(spec.size) if stated is None else stated.copy()
     for sensor in rig.mounted:

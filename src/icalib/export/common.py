@@ -76,8 +76,18 @@ def need(names: Sequence[str], kind: str, program: str) -> None:
         raise CalibrationError(f"this calibration has no {kind}, so there is nothing to export to {program}.")
 
 
+def rolling_shutter(c: Calibration, name: str) -> tuple[float, str, int] | None:
+    """Readout time [s] of a camera, what it exposes one after the other ("row" or "column"), and their number; None for
+    other sensors and global shutters."""
+    shutter, group = c.rig["sensors"][name].get("shutter"), c.group_or_none(name, "readout")
+    if shutter is None or group is None:
+        return None
+    rows = shutter["rolling"] == "rows"
+    return float(group.value[0]), "row" if rows else "column", int(c.rig["sensors"][name]["resolution"][rows])
+
+
 def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence for each of the sensors `names` that has unusable parameters, by verdict."""
+    """A sentence for each of the sensors `names` that has unusable parameters, by verdict, or a rolling shutter."""
     meanings: dict[Verdict, str] = {
         "unobservable": "unobservable, so the value depends on the initial guess",
         "too uncertain": f"too uncertain, with a standard deviation above {TOO_UNCERTAIN:g} tolerances",
@@ -93,6 +103,12 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
         ]
         if labels:
             sentences.append(f"{name}: {', '.join(labels)} is {meaning}.")
+    for name in names:
+        if (shutter := rolling_shutter(c, name)) is not None:
+            sentences.append(
+                f"{name} has a rolling shutter, read out in {1e3 * shutter[0]:.3f} ms: its time offset is that of the "
+                f"middle {shutter[1]}."
+            )
     return tuple(sentences)
 
 

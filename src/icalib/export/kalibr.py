@@ -12,7 +12,16 @@ import numpy as np
 import yaml
 
 from icalib.errors import CalibrationError
-from icalib.export.common import CameraParameters, imu_values, imus, inverse, lens_of, restarts, time_offset
+from icalib.export.common import (
+    CameraParameters,
+    imu_values,
+    imus,
+    inverse,
+    lens_of,
+    restarts,
+    rolling_shutter,
+    time_offset,
+)
 from icalib.geometry import so3
 from icalib.result import Calibration
 from icalib.sensors.camera.stream import CornerResiduals, image_of
@@ -69,7 +78,13 @@ def camchain(calibration: Calibration) -> str:
         for i, name in enumerate(c.cameras)
         if restarts(c, name)
     ]
-    return _text([comment, *_renamed("cam", c.cameras), *restarting, *fits], data)
+    rolling = [
+        f"# cam{i} has a rolling shutter: each {shutter[1]} is exposed line_delay [s] after the one before; "
+        f"timeshift_cam_imu is that of the middle {shutter[1]}."
+        for i, name in enumerate(c.cameras)
+        if (shutter := rolling_shutter(c, name)) is not None
+    ]
+    return _text([comment, *_renamed("cam", c.cameras), *restarting, *rolling, *fits], data)
 
 
 def imu_yaml(calibration: Calibration) -> str:
@@ -121,6 +136,8 @@ def _camera(c: Calibration, index: int, lens: CameraParameters, overlaps: np.nda
     data: dict[str, Any] = {} if c.imu is None else {"T_cam_imu": (T_cam_imu @ _T_imu_kalibr(c, c.imu)).tolist()}
     if index > 0:
         data["T_cn_cnm1"] = (T_cam_imu @ c.T_imu_sensor(c.cameras[index - 1])).tolist()
+    if (shutter := rolling_shutter(c, name)) is not None:
+        data["line_delay"] = shutter[0] / shutter[2]
     return data | {
         "cam_overlaps": np.flatnonzero(overlaps[index]).tolist(),
         **_lens_fields(lens),

@@ -20,6 +20,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from icalib.base.compiled import njit
+from icalib.geometry import so3
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import (
     Poses,
@@ -138,10 +139,42 @@ class SensorPose(NamedTuple):
         R_is, p_is, *each = self
         return SensorPose(R_is, p_is, *(x[indices] if len(x) else x for x in each))
 
+    def velocity_of(self, X: np.ndarray) -> np.ndarray:
+        """(n, 3) m/s: velocity in the frame of the sensor of points X (n, 3) m, one at each pose, at rest in the
+        world."""
+        lever = np.cross(self.rate, self.p_imu_sensor) @ self.R_imu_sensor
+        moved = np.einsum("nij,nj->ni", self.R_sensor_world, self.velocity) + lever
+        return -np.cross(self.rate @ self.R_imu_sensor, X) - moved
+
     @property
     def n_calib(self) -> int:
         """Number of calibration parameters that the poses depend on."""
         return N_POSE_PARAMETERS + self.J_imu.shape[2]
+
+
+SLOPE_LAG_S = 0.1  # s: lag of the differences that give a slope; shorter ones would be noise, longer ones miss motion
+
+
+def rate_slopes(state: State) -> np.ndarray:
+    """(K, 6) slopes of rate [rad/s^2] and acceleration [m/s^3] at keyframes of assumed motion, whose biases are minus
+    both: central differences over SLOPE_LAG_S, recording by recording."""
+    slopes, half = np.zeros((len(state.seconds), 6)), 0.5 * SLOPE_LAG_S
+    for k in state.recordings:
+        t = state.seconds[k]
+        before, after = np.clip(t - half, t[0], t[-1]), np.clip(t + half, t[0], t[-1])
+        rise = [np.interp(before, t, b) - np.interp(after, t, b) for b in state.bias[k].T]
+        slopes[k] = (np.array(rise) / (after - before)).T
+    return slopes
+
+
+def with_slopes(at: SensorPose, slopes: np.ndarray, elapsed: np.ndarray) -> SensorPose:
+    """Poses `at` (n,), without Jacobians, with rates and accelerations that have changed by slopes (n, 6), see
+    `rate_slopes`, times elapsed (n,) s since the keyframe. The poses themselves have constant ones."""
+    t, p = elapsed[:, None], at.p_imu_sensor @ at.R_imu_sensor
+    turn, move = slopes[:, :3] * t**2 / 2.0 @ at.R_imu_sensor, slopes[:, 3:] * t**3 / 6.0 @ at.R_imu_sensor
+    shift = np.einsum("nji,nj->ni", at.R_sensor_world, np.cross(turn, p) + move)
+    R_sensor_world, rate = so3.exp_many(-turn) @ at.R_sensor_world, at.rate + slopes[:, :3] * t
+    return at._replace(R_sensor_world=R_sensor_world, p_world_sensor=at.p_world_sensor + shift, rate=rate)
 
 
 def rows_at(

@@ -121,11 +121,12 @@ NO_TRACK_ENDS = np.zeros(0, dtype=np.int64)
 
 class FeatureSums(NamedTuple):
     """Terms of features in the normal equations of a `Piece`: diagonal (T, 3, 3); side (T, 3, B + 1), feature with
-    calibration parameters, its gradient in the last column; block (E, 3, 6), feature with the camera's pose, for each
+    calibration parameters, its gradient in the last column; block (E, 3, p), feature with the camera's pose, for each
     pair of feature and image.
 
-    pose (I, 6, D), Jacobian of a camera's pose by the keyframe of its image; next_pose (I or 0, 6, D), by the next
-    keyframe. track and image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
+    pose (I, p, D), Jacobian of a camera's pose by the keyframe of its image; next_pose (I or 0, p, D), by the next
+    keyframe. p is 6, or more if an image has several poses, those of a rolling shutter. track and
+    image (E,) of the pairs, keyframe (I,) of the images, all counted from the first of the piece.
     """
 
     diagonal: np.ndarray
@@ -146,14 +147,15 @@ class FeatureSums(NamedTuple):
         keyframe: np.ndarray,
         shape: tuple[int, ...],
         by_next: bool = False,
+        knots: int = 1,
     ) -> FeatureSums:
         """Sums of `n_tracks` features, all zero. shape: (D, B + 1). by_next: whether poses also depend on the next
-        keyframe."""
-        pose = np.zeros((len(keyframe), POSE_DIM, shape[0]))
+        keyframe. knots: poses of an image."""
+        pose = np.zeros((len(keyframe), POSE_DIM * knots, shape[0]))
         return cls(
             np.zeros((n_tracks, 3, 3)),
             np.zeros((n_tracks, 3, shape[1])),
-            np.zeros((len(track), 3, POSE_DIM)),
+            np.zeros((len(track), 3, POSE_DIM * knots)),
             pose,
             pose.copy() if by_next else pose[:0],
             track,
@@ -277,7 +279,7 @@ def plan(
     """Steps that eliminate `n_keyframes` keyframes and all features; with `keep`, all but the last keyframe in this
     direction. ends: keyframes before which all features end; sizes: group sizes, of which the cheapest is taken."""
     n_dims = np.zeros(n_keyframes, dtype=np.int64)
-    np.add.at(n_dims, sums.keyframe[np.unique(sums.image)], POSE_DIM)
+    np.add.at(n_dims, sums.keyframe[np.unique(sums.image)], sums.pose.shape[1])
     coupled = np.minimum(n_dims, sums.dim) if not len(sums.next_pose) else np.full(n_keyframes, sums.dim)
     candidates = [_Lives.of(sums, n_keyframes, forwards, keep, s, ends) for s in sizes]
     lives = min(candidates, key=lambda x: x.cost(coupled, sums.dim, sums.side.shape[2]))

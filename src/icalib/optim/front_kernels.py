@@ -15,12 +15,11 @@ import numpy as np
 
 from icalib.base.compiled import njit
 from icalib.geometry.blas import factorise, solve_transposed, subtract_gram, subtract_product
-from icalib.optim.state import POSE_DIM
 
 
 class FrontChain(NamedTuple):
     """Keyframes of the piece. diagonal, upper (n, D, D), side (n, D, B + 1): sums; forwards: direction of the
-    elimination; turn (n, D, D): orthogonal, its columns are the rotated dimensions; pose and next_pose (I, 6, D):
+    elimination; turn (n, D, D): orthogonal, its columns are the rotated dimensions; pose and next_pose (I, p, D):
     Jacobians of image poses by the rotated dimensions."""
 
     diagonal: np.ndarray
@@ -93,15 +92,15 @@ def _reflect(T, Q):
 def rotate_keyframes(plan, sums, turn, pose, next_pose):
     """Fills the rotation of every keyframe that puts its coupled dimensions first, and the image poses by rotated
     dimensions."""
-    n, dim, seeing = len(turn), turn.shape[1], np.zeros(len(sums.keyframe), dtype=np.bool_)
+    n, dim, p, seeing = len(turn), turn.shape[1], sums.pose.shape[1], np.zeros(len(sums.keyframe), dtype=np.bool_)
     for e in range(len(sums.image)):
         seeing[sums.image[e]] = True
     rows, filled = np.zeros((n, dim, dim)), np.zeros(n, dtype=np.int64)
     for i in range(len(sums.keyframe)):
         k = sums.keyframe[i]
         if seeing[i] and plan.coupled[k] < dim:
-            rows[k, filled[k] : filled[k] + POSE_DIM] = sums.pose[i]
-            filled[k] += POSE_DIM
+            rows[k, filled[k] : filled[k] + p] = sums.pose[i]
+            filled[k] += p
     for k in range(n):
         turn[k] = np.eye(dim)
         if filled[k]:
@@ -207,8 +206,8 @@ def _fill_carry(g, plan, row, carry, U, Wc, uncoupled):
 
 @njit(cache=True, nogil=True)
 def _add_pose(T, n, block, rows, column, into):
-    """Adds (block T)^T to into[rows:rows + n, column:column + 3], with the first n columns of T (6, D)."""
-    for j in range(POSE_DIM):
+    """Adds (block T)^T to into[rows:rows + n, column:column + 3], with the first n columns of T (p, D)."""
+    for j in range(len(T)):
         for k in range(n):
             f = T[j, k]
             for i in range(3):
@@ -249,7 +248,7 @@ def _eliminate_local(g, plan, sums, chain, row, uncoupled, U, Wc, front, coupled
             k = sums.keyframe[i]
             begin = row[k, 0] - uncoupled
             for a in range(3):
-                for j in range(POSE_DIM):
+                for j in range(sums.block.shape[2]):
                     w = sums.block[e, a, j]
                     for b in range(plan.coupled[k]):
                         rows[a, begin + b] += w * chain.pose[i, j, b]

@@ -132,23 +132,24 @@ def _add_calib(i, n, width, A, B, columns, calib, row):
 
 @njit(cache=True, nogil=True)
 def add_gram(k, n_chain, G, T, columns, F, sums):
-    """Adds measurements that depend on one pose, from the Gram matrix of their rows.
+    """Adds measurements that depend on one pose, or on several by one keyframe, from the Gram matrix of their rows.
 
-    G (6 + d + 1, 6 + d + 1): Gram matrix of the Jacobians by the pose and by d further calibration parameters, and of
-    the residual; the first 6 rows suffice if d is 0. T (6, n_chain + c): Jacobian of the pose by keyframes and c
-    calibration parameters. columns (c + d,): see `add_product`. F (6, n_chain + c + d + 1): workspace.
+    G (p + d + 1, p + d + 1): Gram matrix of the Jacobians by the poses, p = 6 for one, and by d further calibration
+    parameters, and of the residual; the first p rows suffice if d is 0. T (p, n_chain + c): Jacobian of the poses by
+    keyframes and c calibration parameters. columns (c + d,): see `add_product`. F (p, n_chain + c + d + 1): workspace.
     """
-    calib, width, n_d = sums.calib, T.shape[1], G.shape[1] - 7
+    calib, width, p = sums.calib, T.shape[1], len(T)
+    n_d = G.shape[1] - p - 1
     n_c, n_b = width - n_chain, calib.shape[0] - 1
-    for i in range(6):
+    for i in range(p):
         for j in range(width):
             F[i, j] = 0.0
-        for q in range(6):
+        for q in range(p):
             g = G[i, q]
             for j in range(width):
                 F[i, j] += g * T[q, j]
         for j in range(n_d + 1):
-            F[i, width + j] = G[i, 6 + j]
+            F[i, width + j] = G[i, p + j]
     add_product(k, n_chain, width, T, F, columns, sums)
     for i in range(n_d):
         a = columns[n_c + i]
@@ -156,18 +157,18 @@ def add_gram(k, n_chain, G, T, columns, F, sums):
             continue
         for j in range(n_d):
             if columns[n_c + j] >= 0:
-                calib[a, columns[n_c + j]] += G[6 + i, 6 + j]
-        calib[a, n_b] += G[6 + i, 6 + n_d]
-        calib[n_b, a] += G[6 + i, 6 + n_d]
+                calib[a, columns[n_c + j]] += G[p + i, p + j]
+        calib[a, n_b] += G[p + i, p + n_d]
+        calib[n_b, a] += G[p + i, p + n_d]
 
 
 @njit(cache=True, nogil=True)
 def add_gradients(k, n_chain, G, T, columns, first, sums):
-    """Adds m gradients G (6 + d, m), by a pose and d calibration parameters, to the columns from `first` on; other
+    """Adds m gradients G (p + d, m), by poses and d calibration parameters, to the columns from `first` on; other
     arguments as in `add_gram`."""
     side, calib, n_c = sums.side, sums.calib, T.shape[1] - n_chain
     for g in range(G.shape[1]):
-        for d in range(6):
+        for d in range(len(T)):
             f = G[d, g]
             for i in range(n_chain):
                 side[k + i // KEYFRAME_DIM, i % KEYFRAME_DIM, first + g] += T[d, i] * f
@@ -176,7 +177,7 @@ def add_gradients(k, n_chain, G, T, columns, first, sums):
                     calib[columns[i], first + g] += T[d, n_chain + i] * f
         for i in range(n_c, len(columns)):
             if columns[i] >= 0:
-                calib[columns[i], first + g] += G[6 + i - n_c, g]
+                calib[columns[i], first + g] += G[len(T) + i - n_c, g]
 
 
 @njit(cache=True, nogil=True)

@@ -221,8 +221,8 @@ class Rig:
 
     @property
     def cameras_alone(self) -> bool:
-        """True if all sensors are cameras."""
-        return len(self.cameras) == len(self.sensors)
+        """True if all sensors are cameras with global shutters: nothing depends on the motion between images."""
+        return len(self.cameras) == len(self.sensors) and not any(c.rolling for c in self.cameras)
 
     @property
     def imus_alone(self) -> bool:

@@ -183,10 +183,10 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
-    explains it. is_effect: zero, and estimated only if the recording shows otherwise. by_images: determined by images,
-    not by motion. motion: advice if the data do not determine the group; {axes} stands for the axes about which the rig
-    hardly turned. motion_on_wheels, motion_without_target and
-    motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing connects the instants.
+    explains it. is_effect: zero, and estimated only if the recording shows otherwise. starts_at_zero: needs no guess.
+    by_images: determined by images, not by motion. motion: advice if the data do not determine the group; {axes} stands
+    for the axes about which the rig hardly turned. motion_on_wheels, motion_without_target and motion_at_rest replace
+    `motion` for rigs on wheels, without target, and where nothing connects the instants.
     """
 
     name: str
@@ -201,6 +201,7 @@ class ParameterSpec:
     is_auxiliary: bool = False
     is_effect: bool = False
     meaning: str = ""
+    starts_at_zero: bool = False
     by_images: bool = False
     motion: str = "move the rig more"
     motion_on_wheels: str = ""

@@ -230,3 +230,19 @@ def test_dropouts_rates_phases_and_small_views():
         assert (np.diff(camera.stamps_ns) > 0).all()
     tiny = simulate(with_camera(scenario, 0, resolution=(40, 40)), seed=8).measurements.cameras[0]
     assert (np.diff(tiny.start) >= 6).all() and len(tiny.stamps_ns) < len(t0)
+
+
+@pytest.mark.parametrize("rolling", ["rows", "columns"])
+def test_a_rolling_shutter_shows_each_corner_at_the_time_of_its_row(rolling):
+    """As a camera with a global shutter does that takes its image then."""
+    readout, scenario = 0.03, handheld(2.0, noiseless=True)
+    rolled = simulate(with_camera(scenario, readout_s=readout, rolling=rolling), 0)
+    axis, truth = ("columns", "rows").index(rolling), rolled.truth.corners["cam0"]
+    stream = rolled.measurements.cameras[0]
+    for n in (5, 700, 2500):
+        row = (truth.uv[n, axis] + 0.5) / (752, 480)[axis] - 0.5
+        then = truth.seconds[stream.image[n]] + readout * row
+        moved = with_camera(scenario, phase_s=then - 0.05, rate_hz=0.1, clock_origin_ns=scenario.imu_clock_origin_ns)
+        one = simulate(moved, 0)
+        corner = one.truth.corners["cam0"].uv[one.measurements.cameras[0].point == stream.point[n]]
+        np.testing.assert_allclose(corner, truth.uv[n : n + 1], rtol=0, atol=1e-5)  # stamps are rounded to ns

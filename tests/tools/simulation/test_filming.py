@@ -87,6 +87,9 @@ def test_an_image_is_rendered_when_it_is_asked_for(filmed: Film, monkeypatch: py
 def test_a_bent_board_cannot_be_filmed(scenario: Scenario):
     with pytest.raises(RigError, match="rendered flat"):
         film(replace(scenario, bow=(0.001, 0.0, 0.0)), 0)
+    rolling = tuple(replace(c, readout_s=0.01) for c in scenario.cameras)
+    with pytest.raises(RigError, match=r"^cam0: images are rendered with a global shutter; simulate tables, or remove"):
+        film(replace(scenario, cameras=rolling), 0)
 
 
 def test_every_format_holds_the_same_images_and_readings(filmed: Film, tmp_path: Path):

@@ -43,6 +43,7 @@ sensors:
     distortion: [0.6, 1.1]
     noise_px: 0.5
     dropouts: [[0.4, 0.5], [2, 2.1]]
+    shutter: {{rolling: columns, readout: 0.012}}
     T_imu_sensor: {POSE}
   top:
     type: lidar
@@ -131,6 +132,7 @@ def test_every_field_arrives(tmp_path):
     assert (ramp.center, ramp.size, ramp.ramp) == ((3.0, 2.0), (1.0, 1.5, 0.5), True)
     assert ramp.yaw_rad == pytest.approx(np.pi / 6) and (box.yaw_rad, box.ramp) == (0.0, False)
     assert not_none(s.room).texture == Texture(2, 0.3, 0.8) and camera.dropouts == ((0.4, 0.5), (2.0, 2.1))
+    assert (camera.rolling, camera.readout_s) == ("columns", 0.012)
     assert s.image_faults == ImageFaults(2, ((1.0, 0.5), (2.0, 1.5)), ((1.2, 1.4),), 0.1, 3)
     assert s.features == Features(300, 20, 2.0, 30, 9.0, 3)
     assert s.board and s.target == AprilGrid(3, 4, 0.1, 0.3, squares=False)

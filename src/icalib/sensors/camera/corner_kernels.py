@@ -53,7 +53,8 @@ class Noise(NamedTuple):
 
 
 class DirectParameters(NamedTuple):
-    """Parameters that act on the image directly, not through the pose of the camera: lens, bloom, shape of bodies.
+    """Parameters that act on the image directly, not through the pose of the camera: lens, bloom, readout, shape of
+    bodies.
 
     pars: indices of the free parameters of the camera model. bloom: shift [px] along direction (N, 2), which is (0, 2)
     without bloom. basis (n_points, s, 3) m: displacement of points in the world per unit of each of the s shape and
@@ -66,13 +67,15 @@ class DirectParameters(NamedTuple):
 
 
 class ViewPoses(NamedTuple):
-    """Poses of the camera and of the target in n views.
+    """Poses of the camera and of the target in n views. knots: number of poses of the camera in each view, see
+    `CornerProjection.share`; that of view i and knot k has index i * knots + k.
 
     R_world_body (n, 3, 3), p_world_body (n, 3) m: pose of each view's body; empty if the target is one body. columns
     (n, c + d): indices of calibration parameters, -1 where fixed. The first c are those of the camera's pose, the
     scene's tilt (2) and the body's pose (6, or 0 for one body). The last d are those of `DirectParameters`."""
 
     camera: SensorPose
+    knots: int
     R_world_scene: np.ndarray
     R_world_body: np.ndarray
     p_world_body: np.ndarray
@@ -83,7 +86,10 @@ class CornerProjection(NamedTuple):
     """Projection of the n corners from number `first` on.
 
     X (n, 3) m: points in the camera frame; uv (n, 2) px; valid (n,) bool, within the range of the model; J_point
-    (n, 2, 3) px/m and J_params (n, 2, P): Jacobians of uv, empty if no normal equations are wanted."""
+    (n, 2, 3) px/m and J_params (n, 2, P): Jacobians of uv, empty if no normal equations are wanted.
+
+    share (n, knots): the camera pose of a corner changes as the sum of its view's poses with these weights, which are 1
+    with a global shutter. by_readout (n, 3) m/s: Jacobian of X by the readout time; (0, 3) with a global shutter."""
 
     first: int
     X: np.ndarray
@@ -91,6 +97,8 @@ class CornerProjection(NamedTuple):
     valid: np.ndarray
     J_point: np.ndarray
     J_params: np.ndarray
+    share: np.ndarray
+    by_readout: np.ndarray
 
 
 class CornerResidualArrays(NamedTuple):
@@ -179,12 +187,12 @@ def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_row
     """Writes the transposed weighted Jacobian of view i into J_rows (D + 1, 2 n), and that by the common error into
     J_shared (m + 1, 2 n).
 
-    Rows: camera pose (6), free model parameters, bloom, shape and size of the body; last, in both, the weighted error.
-    """
+    Rows: camera pose (6) of each knot, free model parameters, bloom, readout time, shape and size of the body; last, in
+    both, the weighted error."""
     n0, n = corners.start[i], corners.start[i + 1] - corners.start[i]
     ns, n_pars, has_bloom = direct.basis.shape[1], len(direct.pars), len(direct.direction) > 0
-    D = 6 + n_pars + has_bloom + ns
-    R = poses.camera.R_sensor_world[i]
+    rolls, knots, by_pose = poses.knots > 1, poses.knots, np.empty(6)
+    D = 6 * knots + n_pars + has_bloom + rolls + ns
     for k in range(n):
         c, root = n0 + k - projection.first, roots[k]
         x, y, z = projection.X[c, 0], projection.X[c, 1], projection.X[c, 2]
@@ -193,21 +201,31 @@ def _fill_rows(i, corners, noise, direct, poses, projection, roots, error, J_row
             at = r * n + k
             a0, a1 = root * projection.J_point[c, r, 0], root * projection.J_point[c, r, 1]
             a2 = root * projection.J_point[c, r, 2]
-            J_rows[0, at] = a1 * z - a2 * y
-            J_rows[1, at] = a2 * x - a0 * z
-            J_rows[2, at] = a0 * y - a1 * x
-            J_rows[3, at], J_rows[4, at], J_rows[5, at] = -a0, -a1, -a2
+            by_pose[0], by_pose[1], by_pose[2] = a1 * z - a2 * y, a2 * x - a0 * z, a0 * y - a1 * x
+            by_pose[3], by_pose[4], by_pose[5] = -a0, -a1, -a2
+            for q in range(knots):
+                for j in range(6):
+                    J_rows[6 * q + j, at] = projection.share[c, q] * by_pose[j]
+            d = 6 * knots
             for q in range(n_pars):
-                J_rows[6 + q, at] = root * projection.J_params[c, r, direct.pars[q]]
-            d = 6 + n_pars
+                J_rows[d + q, at] = root * projection.J_params[c, r, direct.pars[q]]
+            d += n_pars
             if has_bloom:
                 J_rows[d, at] = root * direct.direction[n0 + k, r]
                 d += 1
-            w0 = a0 * R[0, 0] + a1 * R[1, 0] + a2 * R[2, 0]
-            w1 = a0 * R[0, 1] + a1 * R[1, 1] + a2 * R[2, 1]
-            w2 = a0 * R[0, 2] + a1 * R[1, 2] + a2 * R[2, 2]
+            if rolls:
+                by = projection.by_readout[c]
+                J_rows[d, at] = a0 * by[0] + a1 * by[1] + a2 * by[2]
+                d += 1
             for q in range(ns):
-                J_rows[d + q, at] = w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
+                J_rows[d + q, at] = 0.0
+            for m in range(knots if ns else 0):
+                R, share = poses.camera.R_sensor_world[i * knots + m], projection.share[c, m]
+                w0 = share * (a0 * R[0, 0] + a1 * R[1, 0] + a2 * R[2, 0])
+                w1 = share * (a0 * R[0, 1] + a1 * R[1, 1] + a2 * R[2, 1])
+                w2 = share * (a0 * R[0, 2] + a1 * R[1, 2] + a2 * R[2, 2])
+                for q in range(ns):
+                    J_rows[d + q, at] += w0 * basis[q, 0] + w1 * basis[q, 1] + w2 * basis[q, 2]
             J_rows[D, at] = root * error[k, r]
             for q in range(len(noise.precision)):
                 J_shared[q, at] = root * noise.field[n0 + k, r, q]
@@ -235,8 +253,9 @@ class _Workspace(NamedTuple):
     """Reused arrays for one view of at most n corners.
 
     J_rows (D + 1, 2 n), J_shared (m + 1, 2 n): weighted Jacobians, see `_fill_rows`; G (D + 1, D + 1): Gram matrix of
-    J_rows; residual (n, 2) px, error (n, 2) px: with the common error; root (n,) 1/px. J_imu (6, 6), J_chain (6, w):
-    Jacobians of the camera pose by the IMU pose, and by keyframes and calibration parameters; F: see `add_gram`."""
+    J_rows; residual (n, 2) px, error (n, 2) px: with the common error; root (n,) 1/px. J_imu (6, 6): Jacobian
+    of a camera pose by the IMU pose; J_chain (6 knots, w): of all poses of the view by keyframes and calibration
+    parameters; F: see `add_gram`."""
 
     J_rows: np.ndarray
     J_shared: np.ndarray
@@ -255,20 +274,29 @@ def _workspace(corners, noise, direct, poses):
     most = 0
     for i in range(len(corners.start) - 1):
         most = max(most, corners.start[i + 1] - corners.start[i])
-    n_d = len(direct.pars) + (len(direct.direction) > 0) + direct.basis.shape[1]
-    width, D = chain_width(poses.camera) + poses.columns.shape[1], 6 + n_d
+    n_d = len(direct.pars) + (len(direct.direction) > 0) + (poses.knots > 1) + direct.basis.shape[1]
+    n_pose = 6 * poses.knots
+    width, D = chain_width(poses.camera) + poses.columns.shape[1], n_pose + n_d
     return _Workspace(
         np.empty((D + 1, 2 * most)), np.empty((len(noise.precision) + 1, 2 * most)), np.empty((D + 1, D + 1)),
         np.empty((most, 2)), np.empty((most, 2)), np.empty(most),
-        np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1)),
+        np.empty((6, 6)), np.empty((n_pose, width - n_d)), np.empty((n_pose, width + 1)),
     )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _fill_pose_chain(i, poses, J_imu, J_chain):
-    """Writes the Jacobian of the camera pose i into J_chain (6, w): by keyframes, then by the c `ViewPoses.columns`."""
-    fill_chain(i, poses.camera, J_imu, J_chain)
-    R_cam_world, p_world_cam = poses.camera.R_sensor_world[i], poses.camera.p_world_sensor[i]
+def _fill_pose_chains(i, poses, J_imu, J_chain):
+    """Writes the Jacobians of the camera poses of view i into J_chain (6 knots, w)."""
+    for k in range(poses.knots):
+        _fill_pose_chain(i, i * poses.knots + k, poses, J_imu, J_chain[6 * k : 6 * k + 6])
+
+
+@njit(cache=True, nogil=True)
+def _fill_pose_chain(i, at, poses, J_imu, J_chain):
+    """Writes the Jacobian of the camera pose number `at`, of view i, into J_chain (6, w): by keyframes, then by the c
+    `ViewPoses.columns`."""
+    fill_chain(at, poses.camera, J_imu, J_chain)
+    R_cam_world, p_world_cam = poses.camera.R_sensor_world[at], poses.camera.p_world_sensor[at]
     o = J_chain.shape[1] - (8 if len(poses.R_world_body) else 2)
     for r in range(3):
         # Tilting the scene about world x (y) has the same effect as rotating the camera by the opposite angle about
@@ -277,16 +305,16 @@ def _fill_pose_chain(i, poses, J_imu, J_chain):
         J_chain[3 + r, o] = R_cam_world[r, 1] * p_world_cam[2] - R_cam_world[r, 2] * p_world_cam[1]
         J_chain[3 + r, o + 1] = R_cam_world[r, 2] * p_world_cam[0] - R_cam_world[r, 0] * p_world_cam[2]
     if len(poses.R_world_body):
-        _fill_body(i, poses, J_chain)
+        _fill_body(i, at, poses, J_chain)
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _fill_body(i, poses, J_chain):
-    """Writes the Jacobian of the camera pose by the body pose into the last 6 columns of J_chain.
+def _fill_body(i, at, poses, J_chain):
+    """Writes the Jacobian of the camera pose number `at` by the body pose of view i into the last 6 columns of J_chain.
 
     Moving the body by d has the same effect as moving the camera by the inverse of d about the body's origin."""
-    R_cam_world, R_world_body, o = poses.camera.R_sensor_world[i], poses.R_world_body[i], J_chain.shape[1] - 6
-    away = so3.hat(poses.camera.p_world_sensor[i] - poses.p_world_body[i])
+    R_cam_world, R_world_body, o = poses.camera.R_sensor_world[at], poses.R_world_body[i], J_chain.shape[1] - 6
+    away = so3.hat(poses.camera.p_world_sensor[at] - poses.p_world_body[i])
     for r in range(3):
         for j in range(3):
             for k in range(3):
@@ -316,7 +344,7 @@ def accumulate(i0, i1, corners, noise, direct, poses, projection, sums, kept):
         _gram(J_rows, D + 1, 2 * n, G)
         if len(noise.precision):
             marginalise_shared(J_rows, D, n, work.J_shared, noise.precision, G)
-        _fill_pose_chain(i, poses, work.J_imu, J_chain)
+        _fill_pose_chains(i, poses, work.J_imu, J_chain)
         add_gram(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], work.F, sums)
     return total
 
@@ -343,5 +371,5 @@ def accumulate_clusters(i0, i1, cluster, n_clusters, column, corners, noise, dir
                 G[d, cluster[n0 + k]] += J_rows[d, k] * J_rows[D, k] + J_rows[d, n + k] * J_rows[D, n + k]
         if len(noise.precision):
             marginalise_gradients(J_rows, D, n, work.J_shared, noise.precision, cluster[n0:n1], G)
-        _fill_pose_chain(i, poses, work.J_imu, J_chain)
+        _fill_pose_chains(i, poses, work.J_imu, J_chain)
         add_gradients(corners.keyframe[i] - sums.first, n_chain, G, J_chain, poses.columns[i], column, sums)

@@ -18,6 +18,7 @@ from icalib.model.sensor_model import Clusters, Pass, PassEnd, SensorModel, mode
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.point_planes import PlaneAssociation
 from icalib.motion.poses import MERGED_WITHIN_S, instants
+from icalib.motion.sensor_pose import rate_slopes
 from icalib.optim.arrowhead import chain_cuts
 from icalib.optim.state import Layout, State
 from icalib.rig import LENS, Camera, ParameterSpec, Rig, Settings
@@ -38,7 +39,7 @@ from icalib.sensors.camera.corner_noise import (
     with_jitter,
 )
 from icalib.sensors.camera.image_times import are_used, keyframes_of, not_simultaneous, on_common_images
-from icalib.sensors.camera.spec import BLOOM
+from icalib.sensors.camera.spec import BLOOM, READOUT
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_selection import TrackSelection, error_clusters, next_selections, observed_at_keyframes
 from icalib.sensors.camera.track_surfaces import Surfaces, with_curved_patches
@@ -78,8 +79,8 @@ class CameraSensorModel(SensorModel[Camera, CameraNoise]):
     def is_estimated(self, sensor: Camera, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
         """See `SensorModel`. Bloom is estimated only if the target has edges that it shifts.
 
-        Without an IMU, time offsets and the extrinsics of the reference camera are not estimated."""
-        if rig.imu is None and (spec == TIME_OFFSET or (sensor.name == rig.reference and spec in MOUNTED)):
+        Without an IMU, time offsets, readout times and the extrinsics of the reference camera are not estimated."""
+        if rig.imu is None and (spec in (TIME_OFFSET, READOUT) or (sensor.name == rig.reference and spec in MOUNTED)):
             return False
         return sensor.is_estimated(spec) and (spec != BLOOM or rig.blooms)
 
@@ -181,6 +182,8 @@ def corner_factor(camera: Camera, stream: CornerStream, noise: CameraNoise, at: 
         stream, camera_model(camera.model), imu, gravity, scheme, seconds, keyframe,
         noise.keep & np.repeat(used, np.diff(stream.start)), noise.corners, NO_BLOOM, at.bodies, at.layout,
         len(state.seconds), tuple(recording_images.start for recording_images in images[1:]),
+        None if imu is None else camera.shutter,
+        rate_slopes(state) if rig.assumes_motion and camera.rolling is not None else None,
     )  # fmt: skip
     factor = factor if at.coarse else with_circle_centres(with_bent_edges(factor, state), state)
     return with_bloom(factor, state) if rig.blooms else factor

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
 from icalib.geometry.cameras import CAMERA_MODELS, camera_model
 from icalib.sensors.fields import (
     TABLE,
+    choice_or,
     groups_to_plain,
     layout_to_plain,
     parameter_fields,
@@ -59,22 +62,49 @@ BLOOM = ParameterSpec(
     by_images=True,
     motion="show the target from more distances",
 )
+# Time from the exposure of the first row of a rolling shutter to that of the row after the last: that of a row is late
+# by readout (row / height - 1/2). Data sheets state 5 to 33 ms.
+READOUT = ParameterSpec(
+    name="readout",
+    size=1,
+    manifold="vector",
+    unit="s",
+    labels=("readout",),
+    tolerance="time_tolerance_s",
+    prior_sigma=0.02,
+    starts_at_zero=True,
+    motion="turn the rig faster, with points in all rows of the image",
+)
+MAX_READOUT_S = 0.5  # a larger value was meant in ms; no camera of 2 Hz or more needs as long
 LENS = (INTRINSICS.name, DISTORTION.name)  # parameter groups of the camera model
 TRACK_IMAGES = "images"  # value of `tracks`: feature tracks are found in the images
+Rolling = Literal["rows", "columns"]  # what a rolling shutter exposes one after the other
+
+
+class Shutter(NamedTuple):
+    """A rolling shutter. axis: image axis along which it moves, 0 for columns and 1 for rows; size: their number."""
+
+    axis: int
+    size: int
+
+    def phase(self, uv: np.ndarray) -> np.ndarray:
+        """(n,) times of image points uv (n, 2) px after that of the middle of the image, in readout times."""
+        return (uv[:, self.axis] + 0.5) / self.size - 0.5
 
 
 @dataclass(frozen=True)
 class Camera(MountedSensor):
     """One camera of the rig file. Intrinsics are (fx, fy, cx, cy) in pixels, distortion the coefficients of `model`.
 
-    path: table of corners; resolution: (width, height) px."""
+    path: table of corners; resolution: (width, height) px. rolling: what its shutter exposes one after the other, with
+    the parameter `readout` [s]; None for a global shutter, which has no such parameter."""
 
     sensor_type: ClassVar[str] = "camera"
     noun: ClassVar[str] = "camera"
     readings: ClassVar[str] = "images"
     gives_motion: ClassVar[bool] = True
     sees_target: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, INTRINSICS, DISTORTION, BLOOM)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, INTRINSICS, DISTORTION, BLOOM, READOUT)
     lens: ClassVar[tuple[str, ...]] = LENS
     may_change: ClassVar[tuple[tuple[str, ...], ...]] = (*MountedSensor.may_change, (INTRINSICS.name,))
 
@@ -85,6 +115,8 @@ class Camera(MountedSensor):
     intrinsics: Parameter = Parameter()
     distortion: Parameter = Parameter()
     bloom: Parameter = Parameter()
+    readout: Parameter = Parameter()
+    rolling: Rolling | None = None
     topic: str | None = None  # topic of its images; None: the topic with the camera's name, or the only image topic
     tracks: str | None = None  # path of a table of feature tracks, or TRACK_IMAGES
     track_noise_px: float | None = None  # standard deviation per axis; None: estimated from residuals
@@ -106,7 +138,13 @@ class Camera(MountedSensor):
             tolerance=scale * DISTORTION.tolerance,
             prior_sigma=scale * DISTORTION.prior_sigma,
         )
-        return (*MOUNTED, CLOCK_RATE, INTRINSICS, distortion, BLOOM)
+        return (*MOUNTED, CLOCK_RATE, INTRINSICS, distortion, BLOOM, *((READOUT,) if self.rolling else ()))
+
+    @property
+    def shutter(self) -> Shutter | None:
+        """Its rolling shutter; None for a global shutter."""
+        axis = 0 if self.rolling == "columns" else 1
+        return Shutter(axis, self.resolution[axis]) if self.rolling else None
 
     @property
     def tracks_images(self) -> bool:
@@ -115,11 +153,15 @@ class Camera(MountedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Camera:
-        options = ("path", "topic", "corner_noise", "tracks", "track_noise", *TABLE, *parameter_fields(cls))
+        groups_of_all = (name for name in parameter_fields(cls) if name != READOUT.name)
+        options = ("path", "topic", "corner_noise", "tracks", "track_noise", "shutter", *TABLE, *groups_of_all)
         fields = value.record(("type", "model", "resolution"), options)
+        rolling = _rolling(fields)
         model = fields["model"].choice("camera model", tuple(CAMERA_MODELS))
-        groups = parameters(fields, cls(name, "", model, (0, 0)).specs())
+        groups = parameters(fields, cls(name, "", model, (0, 0), rolling=rolling).specs())
         _refuse_negative_focal_length(fields, groups)
+        if READOUT.name in groups and groups[READOUT.name].size and abs(groups[READOUT.name].value[0]) > MAX_READOUT_S:
+            fields[READOUT.name].fail(f"is in seconds, and at most {MAX_READOUT_S:g} s; correct it.")
         return cls(
             name=name,
             path=path_or(fields, f"{name}/corners.csv"),
@@ -129,6 +171,7 @@ class Camera(MountedSensor):
             topic=topic_or_none(fields),
             tracks=fields["tracks"].text() if "tracks" in fields else None,
             track_noise_px=fields["track_noise"].positive() if "track_noise" in fields else None,
+            rolling=rolling,
             layout=table_layout(fields),
             **groups,
         )
@@ -144,7 +187,11 @@ class Camera(MountedSensor):
             plain["tracks"] = self.tracks
         if self.track_noise_px is not None:
             plain["track_noise"] = self.track_noise_px
-        return plain | layout_to_plain(self.layout) | groups_to_plain(self)
+        groups = groups_to_plain(self)
+        readout = groups.pop(READOUT.name)
+        if self.rolling is not None:
+            plain["shutter"] = {"rolling": self.rolling, READOUT.name: readout}
+        return plain | layout_to_plain(self.layout) | groups
 
     def gives_motion_without_imu(self, has_target: bool) -> bool:
         return has_target
@@ -162,6 +209,16 @@ class Camera(MountedSensor):
                 "target is missing; add target, targets for several by name, or tracks (images, or a table of "
                 f"tracks) of {' and '.join(blind)}.",
             )
+
+
+def _rolling(fields: dict[str, YamlValue]) -> Rolling | None:
+    """What the rolling shutter of `shutter` exposes one after the other; None without this field. The readout time
+    moves to `fields`, beside the other parameters."""
+    if "shutter" not in fields:
+        return None
+    shutter = fields["shutter"].record(("rolling",), (READOUT.name,))
+    fields |= {name: shutter[name] for name in (READOUT.name,) if name in shutter}
+    return choice_or(shutter, "rolling", Rolling, None)
 
 
 def _refuse_negative_focal_length(fields: dict[str, YamlValue], groups: dict[str, Parameter]) -> None:

@@ -28,7 +28,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.front import FeatureSums, PieceFeatures, plan
 from icalib.optim.rows import LOSSES, Loss, median_variance
 from icalib.optim.state import Layout, Planes, State
-from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.corner_factor import CornerFactor, RowPoses, row_jacobians
 from icalib.sensors.camera.track_kernels import (
     PieceStart,
     TrackObservations,
@@ -143,8 +143,8 @@ class FeatureFactor(FactorDefaults):
         A, b = np.tile(1e-9 * np.eye(3), (n, 1, 1)), np.zeros((n, 3))
         for view in views:
             rays, valid = view.camera.model.unproject(view.params, view.observed.uv)
-            at = view.poses
-            add_rays(view.observed, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
+            observed, at = view.placed
+            add_rays(observed, 0, at.R_sensor_world, at.p_world_sensor, rays, valid, A, b)
         search = self._descend(views, np.linalg.solve(A, b[:, :, None])[:, :, 0], slice(0, n), None)
         points = self._in_anchors(views, search.xyz, slice(0, n))
         distance = np.linalg.norm(points, axis=1)
@@ -228,7 +228,7 @@ class FeatureFactor(FactorDefaults):
         by_next = any(c.scheme == "pose" and c.imu is not None for c in self.cameras)
         sums = FeatureSums.zeros(
             tracks.stop - tracks.start, self.tracks.pair_track[pairs] - tracks.start, image, keyframe - piece.first,
-            piece.side.shape[1:], by_next,
+            piece.side.shape[1:], by_next, max(c.n_knots for c in self.cameras),
         )  # fmt: skip
         ends = self.tracks.edges - piece.first
         steps = plan(sums, len(piece.diagonal), piece.first == 0 or not keep, keep, ends)
@@ -338,9 +338,14 @@ class FeatureFactor(FactorDefaults):
         lens = self.layout.columns(camera.name, "intrinsics", "distortion")
         pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
-        columns_of_clocks = np.array([np.concatenate([camera.kinematics.columns(k), lens[pars]]) for k in clocks])
-        columns = columns_of_clocks[clock_numbers(state, camera.name, camera.keyframe[i0:i1])]
-        return CameraImages(camera, index, i0, camera.lens(state), observed, camera.poses(state, i0, i1), columns, pars)
+        direct = np.concatenate([lens[pars], camera.readout_columns])
+        columns_of_clocks = np.array([np.concatenate([camera.kinematics.columns(k), direct]) for k in clocks])
+        columns, rows = columns_of_clocks[clock_numbers(state, camera.name, camera.keyframe[i0:i1])], None
+        if camera.shutter is not None:
+            seen, image = slice(*observed.start[[0, -1]].tolist()), np.repeat(images, np.diff(observed.start))
+            rows = camera.rows_of(state, image, stream.uv[seen])
+        poses = camera.knot_poses(state, i0, i1)
+        return CameraImages(camera, index, i0, camera.lens(state), observed, poses, columns, pars, rows)
 
     def _descend(self, views: list[CameraImages], xyz: np.ndarray, tracks: slice, planes: Planes | None) -> PointSearch:
         """Searches the points of `tracks` that minimise the cost, from start values xyz (n, 3) m in the world frame.
@@ -366,7 +371,7 @@ class FeatureFactor(FactorDefaults):
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             rows = np.flatnonzero(camera == view.index)
-            i = image[tracks][rows] - view.first
+            i = view.middle(image[tracks][rows])
             turned = np.einsum("nji,nj->ni", view.poses.R_sensor_world[i], points[rows])
             out[rows] = turned + view.poses.position[i]
         return out
@@ -376,7 +381,7 @@ class FeatureFactor(FactorDefaults):
         out, camera, image = np.empty_like(points), self.tracks.camera[tracks], self.tracks.image
         for view in views:
             rows = np.flatnonzero(camera == view.index)
-            i = image[tracks][rows] - view.first
+            i = view.middle(image[tracks][rows])
             out[rows] = np.einsum("nij,nj->ni", view.poses.R_sensor_world[i], points[rows] - view.poses.position[i])
         return out
 
@@ -388,9 +393,10 @@ OBSERVATIONS_PER_CHUNK = 4096  # observations that are projected at once; their 
 class CameraImages:
     """The n images from number `first` on of one camera, whose index is `index`.
 
-    params (P,): parameters of the camera model; observed: observations of tracks; poses: camera poses. columns
-    (n, c + d): indices of calibration parameters, c of the pose, then d of the free lens parameters, -1 where fixed;
-    pars (d,): indices of the free lens parameters."""
+    params (P,): parameters of the camera model; observed: observations of tracks; poses: camera poses, see
+    `CornerFactor.knot_poses`. columns (n, c + d): indices of calibration parameters, c of the pose, then d of the free
+    lens parameters and of the readout time, -1 where fixed; pars: indices of the free lens parameters. rows: camera
+    poses of the observations with a rolling shutter, see `CornerFactor.rows_of`."""
 
     camera: CornerFactor
     index: int
@@ -400,6 +406,20 @@ class CameraImages:
     poses: SensorPose
     columns: np.ndarray
     pars: np.ndarray
+    rows: RowPoses | None
+
+    @property
+    def placed(self) -> tuple[TrackObservations, SensorPose]:
+        """The observations in groups of one camera pose, which are images or single observations, and these poses."""
+        if self.rows is None:
+            return self.observed, self.poses
+        start = self.observed.start
+        return self.observed._replace(start=np.arange(start[0], start[-1] + 1)), self.rows.at
+
+    def middle(self, image: np.ndarray) -> np.ndarray:
+        """Indices (n,) of the poses at the middle row of images `image` (n,) of the camera."""
+        knots = self.camera.n_knots
+        return (image - self.first) * knots + knots // 2
 
     def chunks(self) -> Iterator[tuple[CameraImages, slice]]:
         """Splits the images at about every `OBSERVATIONS_PER_CHUNK` observations: parts, and slices of their images."""
@@ -411,32 +431,35 @@ class CameraImages:
 
     def _part(self, a: int, b: int) -> CameraImages:
         """The images a..b of these, counted from the first."""
-        observed, images = self.observed, slice(a, b)
+        observed, images, knots = self.observed, slice(a, b), self.camera.n_knots
+        rows = slice(*(observed.start[[a, b]] - observed.start[0]).tolist())
         observed = observed._replace(start=observed.start[a : b + 1], keyframe=observed.keyframe[images])
         return replace(
-            self, first=self.first + a, observed=observed, poses=self.poses.part(images), columns=self.columns[images]
-        )
+            self, first=self.first + a, observed=observed, poses=self.poses.part(slice(knots * a, knots * b)),
+            columns=self.columns[images], rows=None if self.rows is None else self.rows.part(rows),
+        )  # fmt: skip
 
     def in_camera(self, points: np.ndarray, track: int) -> np.ndarray:
         """(n, 3) m: the point of each observation in the camera frame.
 
         points (T, 3) m: points of the tracks from number `track` on, in the world frame."""
-        observed, at = self.observed, self.poses
+        observed, at = self.placed
         X = np.empty((int(observed.start[-1] - observed.start[0]), 3))
         camera_points(observed, track, at.R_sensor_world, at.p_world_sensor, points, X)
         return X
 
     def projection(self, X: np.ndarray) -> TrackProjection:
         """Projection, with Jacobians, of the points X (n, 3) m of all n observations, in the camera frame."""
-        projection = self.camera.model.project_with_jacobians(self.params, X)
-        return TrackProjection(int(self.observed.start[0]), *projection, self.pars)
+        projection, first = self.camera.model.project_with_jacobians(self.params, X), int(self.observed.start[0])
+        share, by_readout = row_jacobians(self.rows, X)
+        return TrackProjection(first, *projection, self.pars, share, by_readout, self.placed[1].R_sensor_world)
 
     def add_to_points(self, track: int, loss: Loss, points: PointSearch) -> None:
         """Adds the observations of points that have not converged to their normal equations in `points`.
 
         points: search for the points of the tracks from number `track` on."""
         for part, _ in self.chunks():
-            observed, at = part.observed, part.poses
+            observed, at = part.placed
             most = int(observed.start[-1] - observed.start[0])
             image, which, X = np.empty(most, dtype=np.int64), np.empty(most, dtype=np.int64), np.empty((most, 3))
             m = moving_points(observed, track, at.R_sensor_world, at.p_world_sensor, points, image, which, X)

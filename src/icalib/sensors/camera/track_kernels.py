@@ -50,7 +50,9 @@ class TrackProjection(NamedTuple):
     """Projection of the n observations from number `first` on.
 
     uv (n, 2) px; valid (n,) bool, within the range of the model; J_point (n, 2, 3) px/m, J_params (n, 2, P): Jacobians
-    of uv by the point in the camera frame and by the lens parameters; pars (d,): indices of the free parameters."""
+    of uv by the point in the camera frame and by the lens parameters; pars (d,): indices of the free parameters.
+    share (n, knots), by_readout (n or 0, 3): see `CornerProjection`. R_cam_world: of each image, or with a rolling
+    shutter of each observation."""
 
     first: int
     uv: np.ndarray
@@ -58,6 +60,9 @@ class TrackProjection(NamedTuple):
     J_point: np.ndarray
     J_params: np.ndarray
     pars: np.ndarray
+    share: np.ndarray
+    by_readout: np.ndarray
+    R_cam_world: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -105,13 +110,13 @@ def predicted_decrease(A_points, gradient):
 
 
 @njit(cache=True, nogil=True)
-def weighted_rows(i, n, X, observed, projection, loss, R_cam_world, error, J_rows):
-    """Writes the transposed weighted Jacobian of observation n in image i into J_rows (6 + d + 3 + 1, 2).
+def weighted_rows(i, n, X, observed, projection, loss, error, J_rows):
+    """Writes the transposed weighted Jacobian of observation n in image i into J_rows (6 knots + d + 3 + 1, 2).
 
-    Its rows: camera pose, free lens parameters, point; last, the weighted residual. Also writes error (2,) px,
-    predicted - measured. Returns root [1/px], the square root of the robust weight over sigma, and half the robust
-    chi^2; both are 0 if the observation is not in use."""
-    c, D = n - projection.first, len(J_rows) - 1
+    Its rows: camera pose of each knot, d free parameters of lens and readout, point; last, the weighted residual.
+    Also writes error (2,) px, predicted - measured. Returns root [1/px], the square root of the robust weight over
+    sigma, and half the robust chi^2; both are 0 if the observation is not in use."""
+    c, D, knots = n - projection.first, len(J_rows) - 1, projection.share.shape[1]
     for r in range(2):
         error[r] = projection.uv[c, r] - observed.uv[n, r]
     if not (observed.keep[n] and projection.valid[c]):
@@ -126,12 +131,19 @@ def weighted_rows(i, n, X, observed, projection, loss, R_cam_world, error, J_row
             root * projection.J_point[c, r, 1],
             root * projection.J_point[c, r, 2],
         )
-        J_rows[0, r], J_rows[1, r], J_rows[2, r] = a1 * z - a2 * y, a2 * x - a0 * z, a0 * y - a1 * x
-        J_rows[3, r], J_rows[4, r], J_rows[5, r] = -a0, -a1, -a2
+        for q in range(knots):
+            share, o = projection.share[c, q], 6 * q
+            J_rows[o, r], J_rows[o + 1, r] = share * (a1 * z - a2 * y), share * (a2 * x - a0 * z)
+            J_rows[o + 2, r] = share * (a0 * y - a1 * x)
+            J_rows[o + 3, r], J_rows[o + 4, r], J_rows[o + 5, r] = -share * a0, -share * a1, -share * a2
         for q in range(len(projection.pars)):
-            J_rows[6 + q, r] = root * projection.J_params[c, r, projection.pars[q]]
+            J_rows[6 * knots + q, r] = root * projection.J_params[c, r, projection.pars[q]]
+        if knots > 1:
+            by = projection.by_readout[c]
+            J_rows[D - 4, r] = a0 * by[0] + a1 * by[1] + a2 * by[2]
+        R = projection.R_cam_world[c if knots > 1 else i]
         for k in range(3):
-            J_rows[D - 3 + k, r] = a0 * R_cam_world[i, 0, k] + a1 * R_cam_world[i, 1, k] + a2 * R_cam_world[i, 2, k]
+            J_rows[D - 3 + k, r] = a0 * R[0, k] + a1 * R[1, k] + a2 * R[2, k]
         J_rows[D, r] = root * error[r]
     if loss.curved and curvature < 1.0:
         correct_curvature(J_rows, D, 0, 1, error, np.sqrt(curvature))
@@ -152,35 +164,43 @@ def _gram(rows, G):
 def _add_feature(i, J_rows, pair, t, J_chain, n_chain, columns, features, by_pose):
     """Adds one observation of image i, with Jacobian J_rows, to the sums of its track t in `features`.
 
-    J_chain (6, w): Jacobian of the camera pose by n_chain keyframe parameters and by calibration parameters; columns
-    (n, c + d): see `CameraImages`; by_pose (6,): workspace."""
+    J_chain (p, w): Jacobian of the camera poses by n_chain keyframe parameters and by calibration parameters; columns
+    (n, c + d): see `CameraImages`; by_pose (p,): workspace."""
     D, n_b, side, block = len(J_rows) - 1, features.side.shape[2] - 1, features.side[t], features.block[pair]
-    n_c = J_chain.shape[1] - n_chain
+    n_c, p = J_chain.shape[1] - n_chain, len(J_chain)
     for a in range(3):
         f0, f1 = J_rows[D - 3 + a, 0], J_rows[D - 3 + a, 1]
         for k in range(3):
             features.diagonal[t, a, k] += f0 * J_rows[D - 3 + k, 0] + f1 * J_rows[D - 3 + k, 1]
         side[a, n_b] += f0 * J_rows[D, 0] + f1 * J_rows[D, 1]
         for q in range(n_c, columns.shape[1]):
-            side[a, columns[i, q]] += f0 * J_rows[6 + q - n_c, 0] + f1 * J_rows[6 + q - n_c, 1]
-        for d in range(6):
+            if columns[i, q] >= 0:
+                side[a, columns[i, q]] += f0 * J_rows[p + q - n_c, 0] + f1 * J_rows[p + q - n_c, 1]
+        for d in range(p):
             by_pose[d] = f0 * J_rows[d, 0] + f1 * J_rows[d, 1]
             block[a, d] += by_pose[d]
         for j in range(n_c):
             if columns[i, j] >= 0:
                 s = 0.0
-                for d in range(6):
+                for d in range(p):
                     s += by_pose[d] * J_chain[d, n_chain + j]
                 side[a, columns[i, j]] += s
 
 
 @njit(cache=True, nogil=True)
-def _fill_pose(i, poses, J_imu, J_chain, features):
-    """Writes the Jacobian of camera pose i by keyframes and calibration parameters into J_chain (6, w).
+def _fill_chains(i, poses, J_imu, J_chain):
+    """Writes the Jacobians of the camera poses of image i, one for each knot, by keyframes and calibration parameters
+    into J_chain (6 knots, w)."""
+    knots = len(J_chain) // 6
+    for k in range(knots):
+        fill_chain(i * knots + k, poses, J_imu, J_chain[6 * k : 6 * k + 6])
 
-    Its keyframe columns are copied to `features`."""
-    fill_chain(i, poses, J_imu, J_chain)
-    for d in range(6):
+
+@njit(cache=True, nogil=True)
+def _fill_poses(i, poses, J_imu, J_chain, features):
+    """Fills J_chain as `_fill_chains`, and copies its keyframe columns to `features`."""
+    _fill_chains(i, poses, J_imu, J_chain)
+    for d in range(len(J_chain)):
         for j in range(KEYFRAME_DIM):
             features.pose[i, d, j] = J_chain[d, j]
         for j in range(KEYFRAME_DIM if len(features.next_pose) else 0):
@@ -202,30 +222,31 @@ def accumulate(X, observed, base, poses, columns, projection, loss, sums, featur
 
     Adds their normal equations to `sums` and `features`, unless the arrays of `sums` are empty. X (n, 3) m: points in
     the camera frame; poses: camera poses; columns (n, c + d): see `CameraImages`. Returns half the robust chi^2."""
-    n_d, n_chain, width = len(projection.pars), chain_width(poses), chain_width(poses) + columns.shape[1]
-    J_rows, G, error = np.zeros((10 + n_d, 2)), np.empty((7 + n_d, 7 + n_d)), np.empty(2)
-    by_pose, most = np.empty(6), _most_observations(observed)
-    rows = np.empty((2 * most, 7 + n_d))
-    J_imu, J_chain, F = np.empty((6, 6)), np.empty((6, width - n_d)), np.empty((6, width + 1))
-    total, D, wanted = 0.0, 9 + n_d, len(sums.diagonal) > 0
+    knots, n_chain, width = projection.share.shape[1], chain_width(poses), chain_width(poses) + columns.shape[1]
+    p, n_d = 6 * knots, len(projection.pars) + (knots > 1)
+    J_rows, G, error = np.zeros((p + n_d + 4, 2)), np.empty((p + n_d + 1, p + n_d + 1)), np.empty(2)
+    by_pose, most = np.empty(p), _most_observations(observed)
+    rows = np.empty((2 * most, p + n_d + 1))
+    J_imu, J_chain, F = np.empty((6, 6)), np.empty((p, width - n_d)), np.empty((p, width + 1))
+    total, D, wanted = 0.0, p + n_d + 3, len(sums.diagonal) > 0
     for i in range(len(observed.start) - 1):
         if wanted:
-            _fill_pose(i, poses, J_imu, J_chain, features)
+            _fill_poses(i, poses, J_imu, J_chain, features)
         m = 0
         for n in range(observed.start[i], observed.start[i + 1]):
             t = observed.track[n] - base.track
             if observed.track[n] < 0:
                 root[n], residual[n, 0], residual[n, 1] = 0.0, 0.0, 0.0
                 continue
-            root[n], cost = weighted_rows(i, n, X, observed, projection, loss, poses.R_sensor_world, error, J_rows)
+            root[n], cost = weighted_rows(i, n, X, observed, projection, loss, error, J_rows)
             residual[n, 0], residual[n, 1] = error[0], error[1]
             total += cost
             if not wanted or root[n] == 0.0:
                 continue
             for r in range(2):
-                for a in range(6 + n_d):
+                for a in range(p + n_d):
                     rows[m + r, a] = J_rows[a, r]
-                rows[m + r, 6 + n_d] = J_rows[D, r]
+                rows[m + r, p + n_d] = J_rows[D, r]
             m += 2
             _add_feature(i, J_rows, observed.pair[n] - base.pair, t, J_chain, n_chain, columns, features, by_pose)
         if wanted:
@@ -240,21 +261,22 @@ def accumulate_clusters(X, observed, base, poses, columns, projection, loss, clu
 
     Gradients by poses and calibration are added to `sums`, gradients by points to side (T, 3, columns). X (n, 3) m:
     points in the camera frame; cluster (N,): index of the cluster of each observation, from 0 to n_clusters - 1."""
-    n_d = len(projection.pars)
-    J_rows, G, error, D = np.zeros((10 + n_d, 2)), np.empty((6 + n_d, n_clusters)), np.empty(2), 9 + n_d
-    J_imu, J_chain = np.empty((6, 6)), np.empty((6, chain_width(poses) + columns.shape[1] - n_d))
+    knots = projection.share.shape[1]
+    p, n_d = 6 * knots, len(projection.pars) + (knots > 1)
+    J_rows, G, error, D = np.zeros((p + n_d + 4, 2)), np.empty((p + n_d, n_clusters)), np.empty(2), p + n_d + 3
+    J_imu, J_chain = np.empty((6, 6)), np.empty((p, chain_width(poses) + columns.shape[1] - n_d))
     for i in range(len(observed.start) - 1):
         G[:] = 0.0
         for n in range(observed.start[i], observed.start[i + 1]):
             if observed.track[n] < 0:
                 continue
-            root, _ = weighted_rows(i, n, X, observed, projection, loss, poses.R_sensor_world, error, J_rows)
+            root, _ = weighted_rows(i, n, X, observed, projection, loss, error, J_rows)
             if root == 0.0:
                 continue
-            for d in range(6 + n_d):
+            for d in range(p + n_d):
                 G[d, cluster[n]] += J_rows[d, 0] * J_rows[D, 0] + J_rows[d, 1] * J_rows[D, 1]
             for a in range(3):
                 by_point = J_rows[D - 3 + a, 0] * J_rows[D, 0] + J_rows[D - 3 + a, 1] * J_rows[D, 1]
                 side[observed.track[n] - base.track, a, column + cluster[n]] += by_point
-        fill_chain(i, poses, J_imu, J_chain)
+        _fill_chains(i, poses, J_imu, J_chain)
         add_gradients(observed.keyframe[i], chain_width(poses), G, J_chain, columns[i], column, sums)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ _MIN_CORNERS = 6  # images with fewer are dropped
 _LEAD_S = 0.05  # images start this long after the IMU, and end this long before it
 _DIFFERENCE_S = 1e-4  # half a step of central differences for the image speed
 _RIM = 64  # points on the rim of a circle
+_ROW_STEPS = 12  # to the instant of a row; each leaves image speed times line delay of the error, 0.06 at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,16 +63,17 @@ def see_corners(
     """Measured corners of one camera, and their truth; images with fewer than 6 corners are dropped."""
     stamps, seconds = image_stamps(scenario, camera, rng)
     surface = board_surface(scenario.target, scenario.bow, scenario.target.points)
-    points = _in_camera(scenario, camera, trajectory, seconds, surface)
+    points, instants = _at_rows(camera, seconds, lambda t: _in_camera(scenario, camera, trajectory, t, surface))
     uv = project(camera, points)
     in_view = visible(camera, points, uv) & _from_the_front(scenario, camera, trajectory, seconds)
     in_view &= _complete_tags(scenario.target, in_view)
     enough = in_view.sum(axis=1) >= _MIN_CORNERS
     stamps, seconds, points, uv, in_view = stamps[enough], seconds[enough], points[enough], uv[enough], in_view[enough]
+    instants = instants[enough]
 
-    uv = uv + camera.bloom_px * _towards_tag_center(scenario, camera, trajectory, seconds, points)
-    uv = uv + _to_ellipse_centres(scenario, camera, trajectory, seconds, uv)
-    sigma = _corner_sigma(scenario, camera, trajectory, seconds, in_view)
+    uv = uv + camera.bloom_px * _towards_tag_center(scenario, camera, trajectory, instants, points)
+    uv = uv + _to_ellipse_centres(scenario, camera, trajectory, instants, uv)
+    sigma = _corner_sigma(scenario, camera, trajectory, instants, in_view)
     image, point = np.nonzero(in_view)
     true = uv[in_view]
     sigma = sigma[image]
@@ -83,15 +86,42 @@ def see_corners(
     return stream, CornerTruth(seconds, true, sigma, outlier)
 
 
+def _at_rows(
+    camera: SimCamera, seconds: np.ndarray, points_at: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Points (M, n, 3) m in the camera frame, each when its row is exposed, and these instants (M, n), by fixed-point
+    iteration. points_at: gives the points at instants (M,) or (M, n). A global shutter exposes all at seconds (M,)."""
+    points, instants, axis = points_at(seconds), seconds, ("columns", "rows").index(camera.rolling)
+    for _ in range(_ROW_STEPS if camera.readout_s else 0):
+        phase = (project(camera, points)[..., axis] + 0.5) / camera.resolution[axis] - 0.5
+        instants = seconds[:, None] + camera.readout_s * np.clip(phase, -0.5, 0.5)
+        points = points_at(instants)
+    return points, instants
+
+
+def _at_row_times(camera: SimCamera, trajectory: TrueTrajectory, seconds: float, world: np.ndarray) -> np.ndarray:
+    """(n, 3) m: points `world` (n, 3) of the world, in one image, see `_at_rows`."""
+    return _at_rows(camera, np.array([seconds]), lambda t: _to_camera(camera, trajectory, t, world))[0][0]
+
+
 def _in_camera(
     scenario: Scenario, camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, points: np.ndarray
 ) -> np.ndarray:
     """(M, n, 3) m: points (n, 3), one for each point of the target in the stated size, in the camera frame at M
-    instants. The true size is applied here."""
-    rotation, position, _ = trajectory.pose_at(seconds)
+    instants, or at (M, n) of their own. The true size is applied here."""
     T_world_body = scenario.body_poses[scenario.target.body]
     world = np.einsum("nij,nj->ni", T_world_body[:, :3, :3], scenario.target_size * points) + T_world_body[:, :3, 3]
-    imu = (world - position[:, None, :]) @ rotation
+    return _to_camera(camera, trajectory, seconds, world)
+
+
+def _to_camera(camera: SimCamera, trajectory: TrueTrajectory, seconds: np.ndarray, world: np.ndarray) -> np.ndarray:
+    """(M, n, 3) m: points `world` (n, 3) of the world in the camera frame at M instants, or at (M, n) of their own."""
+    rotation, position, _ = trajectory.pose_at(seconds.ravel())
+    if seconds.ndim == 1:
+        imu = (world - position[:, None, :]) @ rotation
+    else:
+        away = world - position.reshape(*seconds.shape, 3)
+        imu = np.einsum("mni,mnij->mnj", away, rotation.reshape(*seconds.shape, 3, 3))
     return (imu - camera.T_imu_sensor[:3, 3]) @ camera.T_imu_sensor[:3, :3]
 
 
@@ -212,6 +242,10 @@ def follow(
     for seconds, i, k in due:
         camera, (rotation, position) = scenario.cameras[i], poses[i]
         visible_points, uv = _view(camera, room, features, points, surface, (rotation[k], position[k]))
+        if camera.readout_s:
+            local = _at_row_times(camera, trajectory, seconds, points[visible_points])
+            uv[visible_points] = project(camera, local)
+            visible_points = visible_points[visible(camera, local, uv[visible_points])]
         chosen, number = front_end.choose(i, seconds, visible_points)
         tracked[i].append((number, uv[chosen]))
     noise = float(scenario.robot_noise_enabled)

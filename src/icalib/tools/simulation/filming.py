@@ -557,12 +557,14 @@ def film(scenario: Scenario, seed: int, imaging: Imaging | None = None, exposure
     Images show the target, or without one the textured room from the inside. imaging: by default a lens blur of 0.8 px
     and a noise of 2 grey levels. exposure_s: exposure time, centred on the stamp and averaged over 5 poses, or 4 in a
     room; 0: an instant. The scenario's corner noise, bloom and outliers do not affect images. Raises RigError for a
-    board that is not flat, and if there is neither target nor room.
+    board that is not flat, for rolling shutters, and if there is neither target nor room.
     """
     if not scenario.board and scenario.room is None:
         raise RigError("there is nothing to film; give the scenario a target or a room.")
     if any(scenario.bow):
         raise RigError("boards are rendered flat; set the scenario's bow to zero.")
+    if rolling := next((camera.name for camera in scenario.cameras if camera.readout_s), ""):
+        raise RigError(f"{rolling}: images are rendered with a global shutter; simulate tables, or remove shutter.")
     simulation = simulate(scenario, seed)
     imu = simulation.measurements.imu
     assert imu is not None  # of every scenario

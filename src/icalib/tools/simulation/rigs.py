@@ -106,6 +106,7 @@ def _camera(scenario: Scenario, sim: SimCamera) -> Camera:
         corner_noise_px=sim.corner_noise_px,
         tracks=tracks,
         track_noise_px=None if scenario.features is None else sim.corner_noise_px,
+        rolling=sim.rolling if sim.readout_s else None,
     )
 
 

@@ -16,7 +16,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Target
 from icalib.kinds import simulated_kinds
 from icalib.rig import ImuNoise
-from icalib.sensors.camera.spec import BLOOM, DISTORTION, INTRINSICS
+from icalib.sensors.camera.spec import BLOOM, DISTORTION, INTRINSICS, READOUT, Rolling
 from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
 from icalib.tools.simulation.output import BagWriter
@@ -371,7 +371,9 @@ class SimCamera:
     from t_imu = t_cam + time_offset_s + 1e-6 clock_rate_ppm (t_cam - t_mid), each since the origin of its clock; t_mid
     is the middle of the recording. Stamps are rounded to ns, and the truth is evaluated at the rounded stamp.
     intrinsics: fx, fy, cx, cy [px]. bloom_px: edge bloom, which moves each corner in the image towards the centre of
-    its tag. dropouts: there are no images in these intervals. Raises RigError for an unknown model.
+    its tag. dropouts: there are no images in these intervals. readout_s: from the exposure of the first row, or column
+    (`rolling`), to that of the one after the last; stamps are those of the middle; 0: global shutter.
+    Raises RigError for an unknown model.
     """
 
     name: str
@@ -389,6 +391,8 @@ class SimCamera:
     corner_noise_px: float = 0.2
     bloom_px: float = 0.0
     dropouts: tuple[Interval, ...] = ()
+    readout_s: float = 0.0
+    rolling: Rolling = "rows"
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -398,7 +402,8 @@ class SimCamera:
 
     def true_parameters(self) -> TrueParameters:
         lens = {INTRINSICS.name: np.array(self.intrinsics), DISTORTION.name: np.array(self.distortion)}
-        return TrueParameters({**lens, BLOOM.name: np.array([self.bloom_px])})
+        readout = {READOUT.name: np.array([self.readout_s])} if self.readout_s else {}
+        return TrueParameters({**lens, BLOOM.name: np.array([self.bloom_px]), **readout})
 
 
 @dataclass(frozen=True)

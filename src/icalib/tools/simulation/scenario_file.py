@@ -23,6 +23,7 @@ from icalib.tools.simulation.scenario import (
     MODELS,
     ImageFaults,
     ImuSampling,
+    Rolling,
     Scenario,
     SimCamera,
     SimSensor,
@@ -128,7 +129,7 @@ def _imu(value: YamlValue) -> dict[str, Any]:
 def read_camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
     """A camera from its section `value`; start_ns: origin of all clocks."""
     required = ("model", "resolution", "intrinsics", "distortion", "noise_px")
-    fields, common = mounted_fields(value, start_ns, required, ("dropouts",))
+    fields, common = mounted_fields(value, start_ns, required, ("dropouts", "shutter"))
     model = fields["model"].choice("camera model", MODELS)
     sides = fields["resolution"].items()
     if len(sides) != 2:
@@ -141,8 +142,17 @@ def read_camera(name: str, value: YamlValue, start_ns: int) -> SimCamera:
         tuple(fields["distortion"].vector(PARAMETER_COUNTS[model]).tolist()),
         corner_noise_px=at_least(fields["noise_px"], 0.0),
         dropouts=intervals(fields["dropouts"]) if "dropouts" in fields else (),
+        **_shutter(fields),
         **common,
     )
+
+
+def _shutter(fields: dict[str, YamlValue]) -> dict[str, Any]:
+    """The fields of `SimCamera` for a rolling shutter; none for a global shutter."""
+    if "shutter" not in fields:
+        return {}
+    shutter = fields["shutter"].record(("rolling", "readout"))
+    return {"rolling": choice_or(shutter, "rolling", Rolling, "rows"), "readout_s": shutter["readout"].number()}
 
 
 def _room(value: YamlValue) -> Room:

@@ -199,6 +199,7 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
     }
     for c in scenario.cameras:
         parameters = {"intrinsics": list(map(float, c.intrinsics)), "distortion": list(map(float, c.distortion))}
+        parameters |= {"shutter": {"rolling": c.rolling, "readout": c.readout_s}} if c.readout_s else {}
         sensors[c.name] = _mounted(truth, c.name, "camera") | {"model": c.model} | parameters
     for s in scenario.sensors:
         true = s.true_parameters()

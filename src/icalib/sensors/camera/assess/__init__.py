@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from icalib.sensors.camera.corner_bias import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
 from icalib.sensors.camera.corner_noise import NoiseModel, flow_of_views
 from icalib.sensors.camera.model import CameraNoise, words_on_left_out
-from icalib.sensors.camera.spec import BLOOM, INTRINSICS, LENS
+from icalib.sensors.camera.spec import BLOOM, INTRINSICS, LENS, Rolling
 from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import ON_PLANES
@@ -98,8 +98,16 @@ FEW_ON_PLANES_SHARE = 0.1
 
 
 def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
-    """A sentence if `points_on_planes_m` is set, but no or few tracked points lie on planes of LiDARs."""
+    """A sentence if `points_on_planes_m` is set, but no or few tracked points lie on planes of LiDARs; and on rolling
+    shutters of a rig whose motion is assumed."""
     yield from _plane_warnings(inputs.rig, estimate.problem.factors)
+    rolling = [camera.name for camera in inputs.rig.cameras if camera.rolling]
+    if inputs.rig.assumes_motion and rolling:
+        yield Remark(
+            "rolling_shutter_without_imu",
+            f"without an IMU the motion during the readout of {' and '.join(rolling)} is assumed to be smooth: errors "
+            "of the readout time and of the lens reach three standard deviations. Add an IMU.",
+        )
 
 
 def _plane_warnings(rig: Rig, factors: Mapping[FactorKey, Factor]) -> Iterator[Remark]:
@@ -208,10 +216,11 @@ def rolling_shutters(inputs: Inputs, estimate: Estimate, is_grave: bool) -> Iter
 
 
 class _Shutter(NamedTuple):
-    """Time [s] from the first to the last row of a camera, according to residuals that follow row times image velocity.
-    share: of the squared residuals that it explains; gain: decrease of chi^2."""
+    """Time [s] from the first to the last of the rows or columns (`rolling`) of a camera, according to residuals that
+    follow row times image velocity. share: of the squared residuals that it explains; gain: decrease of chi^2."""
 
     camera: str
+    rolling: Rolling
     seconds: float
     share: float
     gain: float
@@ -222,43 +231,46 @@ def _rolling_shutters(inputs: Inputs, estimate: Estimate) -> list[_Shutter]:
     others beside it show a shutter of the opposite sign, which is not theirs."""
     cameras = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
     moving = [(factor, out) for factor, out in cameras if factor.imu is not None and (out.root > 0.0).any()]
-    shutters = [
-        _shutter(factor, out, estimate.outcome.state, inputs.sensor(factor.name).resolution[1])
+    along = [
+        [_shutter(factor, out, estimate.outcome.state, inputs.sensor(factor.name), r) for r in get_args(Rolling)]
         for factor, out in moving
+        if factor.shutter is None
     ]
+    shutters = [max(both, key=lambda s: s.gain) for both in along]
     rolling = sorted((s for s in shutters if s.share > ROLLING_SHARE), key=lambda s: -s.gain)
     return [s for s in rolling if s.seconds * rolling[0].seconds > 0.0]
 
 
-def _shutter(factor: CornerFactor, out: CornerOutput, state: State, rows: int) -> _Shutter:
+def _shutter(factor: CornerFactor, out: CornerOutput, state: State, camera: Camera, rolling: Rolling) -> _Shutter:
     """Regression of corner residuals on row times image velocity. It understates the time, because the motion follows
     some of the effect."""
+    shutter = replace(camera, rolling=rolling).shutter
+    assert shutter is not None
     square = along = total = 0.0
     for v0, v1 in factor.blocks():
         corners = factor.corners_of(v0, v1)
         used = out.root[corners] > 0.0
         weight = out.root[corners][used, None].astype(np.float64)
-        row = factor.stream.uv[corners][used, 1:] / rows - 0.5
+        row = shutter.phase(factor.stream.uv[corners][used])[:, None]
         effect = weight * row * flow_of_views(factor, state, v0, v1)[used]
         residual = weight * out.residual[corners][used]
         square += float(np.vdot(effect, effect))
         along += float(np.vdot(effect, residual))
         total += float(np.vdot(residual, residual))
     if square == 0.0 or along == 0.0:
-        return _Shutter(factor.name, 0.0, 0.0, 0.0)
+        return _Shutter(factor.name, rolling, 0.0, 0.0, 0.0)
     gain = along**2 / square
     # Residuals are predicted minus measured. A late row shows points farther along their motion.
-    return _Shutter(factor.name, -along / square, gain / total, gain)
+    return _Shutter(factor.name, rolling, -along / square, gain / total, gain)
 
 
 def _shutter_words(s: _Shutter) -> Remark:
     """A sentence on a rolling shutter."""
     return Remark(
         "rolling_shutter",
-        f"{s.camera} has a rolling shutter: corner residuals follow row times image speed, as if its rows were exposed "
-        f"over {1e3 * abs(s.seconds):.2g} ms or more, which explains {s.share:.0%} of their squares. Every row is "
-        "taken as exposed at the stamp. Use a global shutter or a mode that reads out faster; or stop at each view, "
-        "and calibrate pictures of the stops without the IMU.",
+        f"{s.camera} has a rolling shutter. Corner residuals follow {s.rolling[:-1]} times image speed, as if its "
+        f"{s.rolling} were exposed over {1e3 * abs(s.seconds):.2g} ms or more, which explains {s.share:.0%} of their "
+        f"squares. Write shutter: {{rolling: {s.rolling}}}, and its readout time is estimated.",
     )
 
 

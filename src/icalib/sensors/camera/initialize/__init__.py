@@ -26,6 +26,7 @@ from icalib.estimate.inputs import Inputs, inputs_for
 from icalib.estimate.problem import keyframe_times, keyframes_for, motion_of, start_values
 from icalib.geometry.cameras import camera_model
 from icalib.geometry.targets.base import BOARD
+from icalib.initialize.assumed_motion import SLOW_HZ
 from icalib.initialize.initializer import (
     BY_TARGET,
     BY_TRACKS,
@@ -109,6 +110,7 @@ class CameraInitializer(Initializer[Camera]):
 
     def body_poses(self, rig: Rig, recordings: Sequence[Measurements]) -> BodyTrajectory:
         """See `Initializer`: poses of the body from the images of all cameras, without an IMU."""
+        _refuse_slow_shutters(rig, recordings)
         cameras_only = rig.only(*(c.name for c in rig.cameras))
         inputs = inputs_for(cameras_only, [m.only(*cameras_only.sensors) for m in recordings])
         (guess,) = initial_guesses(cameras_only, inputs.bodies, [m.measurements for m in inputs.motions])
@@ -125,6 +127,18 @@ class CameraInitializer(Initializer[Camera]):
         if failed.converges is None or failed.rig.has_target:
             return None
         return no_parallax(failed.rig, failed.recordings)
+
+
+def _refuse_slow_shutters(rig: Rig, recordings: Sequence[Measurements]) -> None:
+    """Raises EstimationError if images with a rolling shutter do not resolve the motion, in a rig without an IMU."""
+    for camera in (c for c in rig.cameras if c.rolling):
+        for stream in (m.streams[camera.name] for m in recordings):
+            rate = (len(stream.seconds) - 1) / max(float(stream.seconds[-1]), 1e-9) if len(stream.seconds) else 0.0
+            if rate < SLOW_HZ:
+                raise EstimationError(
+                    f"{camera.name}: without an IMU a rolling shutter needs {SLOW_HZ:g} images in a second, and has "
+                    f"{rate:.2g}; record faster, add an IMU, or hold still at each view and remove shutter."
+                )
 
 
 def _guesses_by_recording(inputs: Inputs, fallback: Callable[[], InputsWithMotion]) -> tuple[Guess, ...]:
