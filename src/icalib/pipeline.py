@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
-from functools import partial
+from functools import partial, reduce
 from math import inf
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from icalib.errors import EstimationError, RecordingError
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.problem import Problem
 from icalib.estimate.solver import Visit
-from icalib.initialize.rig_guess import Attempt, attempt, solved, with_effects
+from icalib.initialize.rig_guess import Attempt, attempt, solved
 from icalib.kinds import readers
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
@@ -184,11 +184,13 @@ def _calibrate(
 def _assessed(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, Calibration]:
     """The attempt and its result. If the recording shows effects that the rig lacks, those of the rig with them."""
     first = make(rig)
-    result, effects = assess(first.inputs, first.solution, first.against)
-    if effects:
+    result, remedies = assess(first.inputs, first.solution, first.against)
+    if remedies:
         with suppress(EstimationError):
-            second = _assessed(with_effects(rig, effects), make)
-            return second if second[0].converged else (first, result)
+            second, better = _assessed(reduce(lambda rig, remedy: remedy.amended(rig), remedies, rig), make)
+            if second.converged:
+                notes = tuple(remedy.note for remedy in remedies if remedy.note is not None)
+                return second, dataclasses.replace(better, notes=(*better.notes, *notes))
     return first, result
 
 

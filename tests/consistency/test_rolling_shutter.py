@@ -122,11 +122,15 @@ def test_the_covariance_is_honest(readout_s: float) -> None:
 
 
 @pytest.mark.parametrize(("readout_s", "named"), [(0.0, False), (0.004, True), (-0.03, True)])
-def test_it_is_named_where_the_rig_file_has_none(readout_s: float, named: bool) -> None:
+def test_it_is_estimated_where_the_rig_file_has_none(readout_s: float, named: bool) -> None:
     simulation = simulate(rolling(handheld(6.0), 0.0, readout_s), 3)
     rig = all_free(simulation)
     rig = rig.with_(cameras=tuple(replace(c, rolling=None) for c in rig.cameras))
     result = calibrate_measurements(rig, simulation.measurements)
-    said = [reason for reason in result.reasons if reason.name == "rolling_shutter"]
-    assert [reason.split()[0] for reason in said] == (["cam1"] if named else [])
-    assert not named or (result.reasons[0] == said[0] and "{rolling: columns}" in said[0])
+    said = [note for note in result.notes if note.name == "rolling_shutter_estimated"]
+    assert [note.split()[0] for note in said] == (["cam1"] if named else [])
+    assert not named or "{rolling: columns}" in said[0]
+    assert "rolling_shutter" not in names(result.reasons)
+    if named:
+        readout = result.group("cam1", "readout")
+        assert abs(readout.value[0] - readout_s) < min(4.0 * readout.std[0], 1e-4)

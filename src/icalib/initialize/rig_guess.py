@@ -37,7 +37,6 @@ from icalib.initialize.initializer import (
 )
 from icalib.observability.contradictions import Contradiction, contradicted_by
 from icalib.observability.determination import Determined, determine
-from icalib.observability.prior_sensitivity import Effect
 from icalib.optim.arrowhead import NotDefiniteError
 from icalib.optim.memory import trim_heap
 from icalib.optim.state import State
@@ -219,12 +218,6 @@ def attempt(rig: Rig, recordings: Sequence[Measurements], lap: Callable[[str], N
         assert failed is not None
         raise explained_failure(rig, recordings, make, failed)
     return first
-
-
-def with_effects(rig: Rig, effects: Sequence[Effect]) -> Rig:
-    """The rig with priors on `effects`, so that they are estimated."""
-    priors = {(e.sensor, e.spec.name): Parameter("prior", np.zeros(1), np.full(1, e.prior_sigma)) for e in effects}
-    return with_groups(rig, lambda sensor, name, p: priors.get((sensor.name, name), p))
 
 
 def _attempt_or_error(rig: Rig, make: Callable[[Rig], Attempt]) -> tuple[Attempt, None] | tuple[None, EstimationError]:

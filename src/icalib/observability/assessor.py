@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Segments
 from icalib.kinds import assessors
-from icalib.observability.prior_sensitivity import Effect, Relaxed
+from icalib.observability.prior_sensitivity import Relaxed
 from icalib.optim.state import Key, State
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Plane, Timeline
@@ -25,17 +25,25 @@ Groups = Mapping[Key, ParameterGroup]
 Remarks = Iterable[Remark]
 
 
+class Remedy(NamedTuple):
+    """How an estimate includes an effect of the whole recording. amended: gives the rig that has it; note: what to say
+    of a result of that rig, None if the result says it."""
+
+    amended: Callable[[Rig], Rig]
+    note: Remark | None = None
+
+
 @dataclass(frozen=True)
 class Cause:
     """A possible cause. sentence: the fault, and what to do about it; gain: the decrease of chi^2 if it is modelled;
     grave: whether the result must not be used; explains: parameter groups whose stated values contradict the data for
-    this cause, so that the contradiction needs no other sentence; effect: of the whole recording, that models it."""
+    this cause, so that the contradiction needs no other sentence; remedy: None if no model has it."""
 
     sentence: Remark
     gain: float
     grave: bool = False
     explains: tuple[Key, ...] = ()
-    effect: Effect | None = None
+    remedy: Remedy | None = None
 
 
 @dataclass(frozen=True)

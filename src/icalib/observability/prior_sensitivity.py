@@ -35,7 +35,7 @@ from icalib.optim.arrowhead import (
     sums_of_priors,
 )
 from icalib.optim.state import Block, Key, Layout, State
-from icalib.rig import Parameter, ParameterSpec, Sensor
+from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
 from icalib.sensors.sensor import ROTATION
 
 # information in tolerance units, noise in the Jacobian included; below it a direction is reset to the guess
@@ -384,6 +384,12 @@ class Effect:
     def gain(self) -> float:
         """Decrease of chi^2 where it is estimated."""
         return (self.value / self.std) ** 2
+
+    def amended(self, rig: Rig) -> Rig:
+        """The rig with a prior on the effect, so that it is estimated."""
+        prior = Parameter("prior", np.zeros(1), np.full(1, self.prior_sigma))
+        effect = (self.sensor, self.spec.name)
+        return with_groups(rig, lambda sensor, name, p: prior if (sensor.name, name) == effect else p)
 
     @property
     def prior_sigma(self) -> float:

@@ -28,10 +28,9 @@ from icalib.estimate.solver import Visit
 from icalib.kinds import assessors
 from icalib.motion.imu_data import hardly_turned
 from icalib.motion.poses import PPM
-from icalib.observability.assessor import AssessedEstimate, assessments
+from icalib.observability.assessor import AssessedEstimate, Remedy, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
-from icalib.observability.prior_sensitivity import Effect
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
@@ -58,8 +57,8 @@ from icalib.validation.guesses import guess_notes
 
 def assess(
     inputs: Inputs, determined: Determined, against: Sequence[Contradiction] = ()
-) -> tuple[Calibration, tuple[Effect, ...]]:
-    """The result of the estimate `determined`, and the effects that the recording shows and the estimate lacks.
+) -> tuple[Calibration, tuple[Remedy, ...]]:
+    """The result of the estimate `determined`, and remedies for effects that it lacks and the recording shows.
     against: values of the rig file that the data contradict so strongly that other faults of the estimate may follow
     from them."""
     estimate, rig = determined.estimate, inputs.rig
@@ -90,7 +89,7 @@ def assess(
         cross_validation=validation,
         wrong=grave,
     )
-    return result, tuple(c.effect for c in causes if c.effect is not None)
+    return result, tuple(c.remedy for c in causes if c.remedy is not None)
 
 
 def _calibration(assessed: AssessedEstimate, determined: Determined, observability: Observability) -> Calibration:

@@ -16,7 +16,7 @@ from icalib.estimate.residual_statistics import Segments, rows_of
 from icalib.kinds import assessors
 from icalib.motion.factor import FitKey
 from icalib.motion.poses import PPM
-from icalib.observability.assessor import AssessedEstimate, Cause, assessments
+from icalib.observability.assessor import AssessedEstimate, Cause, Remedy, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, effects_left_out, relaxed
 from icalib.optim.state import Key
@@ -217,7 +217,7 @@ def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: 
                 "record again."
             )
             grave = late_s > LARGE * rig.settings.time_tolerance_s
-            yield Cause(Remark("clock_drifts", sentence), e.gain, grave, effect=e)
+            yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=Remedy(e.amended))
 
 
 def _clear_change(by_gain: Sequence[Change], spread: Scatter) -> Change | None:

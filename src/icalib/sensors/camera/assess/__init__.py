@@ -15,7 +15,7 @@ from icalib.estimate.inputs import Inputs
 from icalib.geometry import so3
 from icalib.motion.factor import Factor, FactorKey, of_type, pairs_of
 from icalib.motion.poses import instants, usable
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause, Remedy
 from icalib.optim.state import State
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Timeline
@@ -212,7 +212,19 @@ def rolling_shutters(inputs: Inputs, estimate: Estimate, is_grave: bool) -> Iter
     """A cause for each camera with a rolling shutter, which also explains why fixed lenses contradict the data."""
     lenses = tuple((camera.name, group) for camera in inputs.rig.cameras for group in LENS)
     for shutter in _rolling_shutters(inputs, estimate):
-        yield Cause(_shutter_words(shutter), shutter.gain, is_grave, lenses)
+        yield Cause(_shutter_words(shutter), shutter.gain, is_grave, lenses, _estimated(shutter))
+
+
+def _estimated(s: _Shutter) -> Remedy:
+    """The readout time of a rolling shutter as a parameter."""
+    sentence = (
+        f"{s.camera} has a rolling shutter, and its readout time was estimated, too; write shutter: {{rolling: "
+        f"{s.rolling}}}."
+    )
+    return Remedy(
+        lambda rig: rig.with_sensors(replace(rig.sensors[s.camera], rolling=s.rolling)),
+        Remark("rolling_shutter_estimated", sentence),
+    )
 
 
 class _Shutter(NamedTuple):
