@@ -60,6 +60,12 @@ def with_segments(simulation: Simulation) -> Rig:
     return replace(rig, settings=replace(rig.settings, segments=8))
 
 
+def rates_are_estimated(run: Run) -> None:
+    for sensor in ("cam0", "lidar0", "wheel0"):
+        rate = run.result.group(sensor, "clock_rate")
+        assert rate.std[0] < 30.0 and abs(abs(rate.value[0]) - RATE_PPM) < 4.0 * rate.std[0]
+
+
 def no_rates(run: Run) -> None:
     assert all(g.mode == "fixed" for g in run.result.groups if g.name == "clock_rate")
 
@@ -76,7 +82,7 @@ CASES: dict[str, Case] = {
     ),
     "camera, LiDAR and wheels, whose rates the recording shows": Case(
         lambda: simulate(drifting(make_robot("3d", 20.0, "clw")), 0),
-        [known(), rates_within(19.0, "cam0", "lidar0", "wheel0")],
+        [known(), rates_are_estimated],
         with_segments,
         planes_found,
         full=True,

@@ -13,7 +13,7 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.residual_statistics import Segments
 from icalib.kinds import assessors
-from icalib.observability.prior_sensitivity import Relaxed
+from icalib.observability.prior_sensitivity import Effect, Relaxed
 from icalib.optim.state import Key, State
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Plane, Timeline
@@ -49,7 +49,8 @@ class Cause:
 @dataclass(frozen=True)
 class AssessedEstimate:
     """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
-    deviations; segments: of the recording, None if it is not split. relaxed_rig: the estimate without fixed values;
+    deviations; segments: of the recording, None if it is not split. effects: that the estimate
+    leaves out. relaxed_rig: the estimate without fixed values;
     None if it is not known."""
 
     inputs: Inputs
@@ -59,6 +60,7 @@ class AssessedEstimate:
     factor: float
     segments: Segments | None
     timeline: Timeline
+    effects: tuple[Effect, ...]
     relaxed_rig: Relaxed | None = None
 
     @property

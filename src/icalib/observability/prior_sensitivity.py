@@ -311,7 +311,8 @@ def _linearised(
         problem = estimate.measurement_model.problem(inputs, state, fixed_directions)
         priors = (replace(p, sigma=WIDE * p.sigma) if p.block.key in effects else p for p in problem.priors)
         problem = replace(problem, priors=tuple(priors))
-        pieces, residuals = problem.pieces(), problem.residuals()
+        # the same residuals again, as the state is the same, and what is new in the layout is zero or as stated
+        pieces, residuals = problem.pieces(), problem.reusable_output(estimate.outcome.residuals)
         problem.linearise(state, pieces, residuals, curved=True)
         return problem, state, problem.solve(pieces), residuals
     except EstimationError:
@@ -366,6 +367,7 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 # Effects that the estimate leaves out: parameters that are zero, and not estimated, by default.
 
 
+EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
@@ -398,7 +400,8 @@ class Effect:
 
 
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
-    """All effects that the rig file does not mention, tested together; none without convergence."""
+    """All effects that the rig file does not mention, tested together; none without convergence, or if none differs
+    from zero."""
     tested = {
         (s.name, spec.name): spec
         for s in inputs.rig.mounted
@@ -414,6 +417,8 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
     t = problem.tolerance
     root = restricted_root(t[:, None] * solution.information * t, problem.fixed_directions)
     step, variance = -t * (root @ (root.T @ (t * solution.gradient[:-1]))), t**2 * (root**2).sum(axis=1)
+    if all(step[k] ** 2 < EFFECT_SIGMAS**2 * variance[k] for k in columns.values()):
+        return ()
     outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
     if (parts := Segments.of(problem, outcome, inputs.rig.settings.segments)) is not None:
         variance = np.maximum(variance, spread_variance(outcome, parts.after(step), noise_variance(problem, outcome)))

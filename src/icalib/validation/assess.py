@@ -31,6 +31,7 @@ from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Remedy, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
+from icalib.observability.prior_sensitivity import effects_left_out
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
@@ -62,6 +63,7 @@ def assess(
     against: values of the rig file that the data contradict so strongly that other faults of the estimate may follow
     from them."""
     estimate, rig = determined.estimate, inputs.rig
+    effects = effects_left_out(inputs, estimate)  # first, as it needs much memory for a moment
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
     contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
     changes = [change for _, change in contradicting]
@@ -72,7 +74,9 @@ def assess(
     timeline = Timeline.of(inputs.parts, _keyframe_instants(inputs, estimate.outcome.state), rig.reference)
     factors = _factors(inputs, groups)
     sensor_fits = _sensor_fits(inputs, estimate)
-    assessed = AssessedEstimate(inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline)
+    assessed = AssessedEstimate(
+        inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline, effects
+    )
     causes, size_notes = all_causes(assessed, against)
     grave = tuple(c.sentence for c in causes if c.grave)
     warnings = (

@@ -18,7 +18,7 @@ from icalib.motion.factor import FitKey
 from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Cause, Remedy, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
-from icalib.observability.prior_sensitivity import Relaxed, effects_left_out, relaxed
+from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, Relaxed, relaxed
 from icalib.optim.state import Key
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
@@ -195,7 +195,7 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool)
     yield from ranked(causes)[:1]
 
 
-EFFECT_SIGMAS = 5.0  # standard deviations from which an effect is estimated
+LIKELY = 10.0  # times its usual size: a larger effect, of 500 ppm, is named only, as something else may look like it
 
 
 def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: Change | None) -> Iterator[Cause]:
@@ -206,7 +206,7 @@ def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: 
     drifting = clear.sensors if clear is not None and clear.is_clock_drift else ()
     rig = assessed.inputs.user_rig or assessed.inputs.rig
     duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
-    for e in effects_left_out(assessed.inputs, assessed.estimate):
+    for e in assessed.effects:
         differs = abs(e.value) > EFFECT_SIGMAS * e.std or e.sensor in drifting
         if differs and (e.sensor,) not in jumping:
             late_s = PPM * abs(e.value) * duration
@@ -216,8 +216,9 @@ def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: 
                 f"{e.prior_sigma:.0f}}}, and leave time_offset free; or stamp all sensors by one clock, and "
                 "record again."
             )
+            remedy = Remedy(e.amended) if abs(e.value) < LIKELY * e.spec.prior_sigma else None
             grave = late_s > LARGE * rig.settings.time_tolerance_s
-            yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=Remedy(e.amended))
+            yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=remedy)
 
 
 def _clear_change(by_gain: Sequence[Change], spread: Scatter) -> Change | None:
