@@ -22,8 +22,9 @@ print(next(line.split()[1] for line in open("/proc/self/status") if line.startsw
 """
 SHORT_S, LONG_S = 60.0, 360.0
 # Of a corner: where it is, its point, standard deviation, residual, weight, bloom, and whether it is kept.
-# The score test of effects has a second factor for a moment: standard deviation, bloom, and whether it is kept.
-CORNER_BYTES = 16 + 8 + 8 + 8 + 4 + 8 + 1 + 17
+# The score test of effects has a second factor for a moment: residual, weight, standard deviation, bloom, and whether
+# it is kept.
+CORNER_BYTES = 16 + 8 + 8 + 8 + 4 + 8 + 1 + 37
 # Of a keyframe: two blocks of 15 x 15, 15 x 25 with the calibration, preintegration, ten readings, states and steps.
 KEYFRAME_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
 LEAST, MOST = 0.75, 1.2  # of what is needed: work space and what the allocator holds are much the same in both

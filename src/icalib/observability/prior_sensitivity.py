@@ -311,8 +311,7 @@ def _linearised(
         problem = estimate.measurement_model.problem(inputs, state, fixed_directions)
         priors = (replace(p, sigma=WIDE * p.sigma) if p.block.key in effects else p for p in problem.priors)
         problem = replace(problem, priors=tuple(priors))
-        # the same residuals again, as the state is the same, and what is new in the layout is zero or as stated
-        pieces, residuals = problem.pieces(), problem.reusable_output(estimate.outcome.residuals)
+        pieces, residuals = problem.pieces(), problem.residuals()
         problem.linearise(state, pieces, residuals, curved=True)
         return problem, state, problem.solve(pieces), residuals
     except EstimationError:
