@@ -168,10 +168,10 @@ def _calibrate(
                 " Besides, ".join(stated_words(best_attempt.inputs, c) for c in best_attempt.against)
             ) from best_attempt.error
         clock.lap("solving")
+        progress("assessing the result", 0.9)
         return best_attempt
 
     best_attempt, result = _assessed(rig, make)
-    progress("assessing the result", 0.9)
     _refuse_no_numbers(result, rig)
     lidars = [s.name for s in rig.sensors.values() if s.shows_planes]
     if best_attempt.inputs.association.at_rest:  # of a recording that goes on between the stops only these

@@ -8,7 +8,7 @@ changes with the square of their roll.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -267,9 +267,7 @@ class Relaxed:
         fixed_directions = (
             np.hstack([fixed, self.problem.fixed_directions]) if self.problem.fixed_directions.size else fixed
         )
-        root = restricted_root(t[:, None] * (self.solution.information - known) * t, fixed_directions)
-        step = -root @ (root.T @ (t * (self.solution.gradient[:-1] - pull)))
-        return t * step, t * np.sqrt((root**2).sum(axis=1))
+        return _newton_step(self.solution.information - known, self.solution.gradient[:-1] - pull, t, fixed_directions)
 
     def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
         """The outcome without the priors on the groups `freed`, and the gradient (B,) of the calibration parameters.
@@ -283,6 +281,15 @@ class Relaxed:
         """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
         priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
         return sums_of_priors(priors, self.state, self.layout.size)[1:]
+
+
+def _newton_step(
+    information: np.ndarray, gradient: np.ndarray, t: np.ndarray, fixed_directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(B,) step of the calibration parameters for their information (B, B) and gradient (B,), and (B,) its standard
+    deviations. fixed_directions (B, m): in units of the tolerances t (B,)."""
+    root = restricted_root(t[:, None] * information * t, fixed_directions)
+    return -t * (root @ (root.T @ (t * gradient))), t * np.sqrt((root**2).sum(axis=1))
 
 
 def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
@@ -345,7 +352,12 @@ def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
         wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
         return Parameter("free", p.value) if wanted and p.value is not None else p
 
-    return with_association(replace(inputs, rig=with_groups(inputs.rig, freed)), inputs.association)
+    return _treated(inputs, freed)
+
+
+def _treated(inputs: Inputs, treated: Callable[[Sensor, str, Parameter], Parameter]) -> Inputs:
+    """`inputs` with each group of the rig replaced as by `with_groups`."""
+    return with_association(replace(inputs, rig=with_groups(inputs.rig, treated)), inputs.association)
 
 
 def _is_stated(parameter: Parameter) -> bool:
@@ -364,7 +376,6 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 
 
 # Effects that the estimate leaves out: parameters that are zero, and not estimated, by default.
-
 
 EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
@@ -407,19 +418,16 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
         for spec in s.specs()
         if spec.is_effect and (p := getattr(s, spec.name)).mode == "fixed" and p.value is None
     }
-    rig = with_groups(inputs.rig, lambda s, name, p: Parameter() if (s.name, name) in tested else p)
-    freed = with_association(replace(inputs, rig=rig), inputs.association)
+    freed = _treated(inputs, lambda s, name, p: Parameter() if (s.name, name) in tested else p)
     columns = {key: freed.layout.columns(*key)[0] for key in tested if freed.layout.is_free(*key)}
     if not (columns and estimate.outcome.converged) or (linearised := _linearised(freed, estimate, tested)) is None:
         return ()
     problem, state, solution, residuals = linearised
-    t = problem.tolerance
-    root = restricted_root(t[:, None] * solution.information * t, problem.fixed_directions)
-    step, variance = -t * (root @ (root.T @ (t * solution.gradient[:-1]))), t**2 * (root**2).sum(axis=1)
-    if all(step[k] ** 2 < EFFECT_SIGMAS**2 * variance[k] for k in columns.values()):
+    step, std = _newton_step(solution.information, solution.gradient[:-1], problem.tolerance, problem.fixed_directions)
+    if all(abs(step[k]) < EFFECT_SIGMAS * std[k] for k in columns.values()):
         return ()
     outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
     if (parts := Segments.of(problem, outcome, inputs.rig.settings.segments)) is not None:
-        variance = np.maximum(variance, spread_variance(outcome, parts.after(step), noise_variance(problem, outcome)))
-    std = np.sqrt(variance)
+        scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
+        std = np.maximum(std, np.sqrt(scattered))
     return tuple(Effect(key[0], tested[key], float(step[k]), float(std[k])) for key, k in columns.items())

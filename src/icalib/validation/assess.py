@@ -31,7 +31,7 @@ from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Remedy, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
-from icalib.observability.prior_sensitivity import effects_left_out
+from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, effects_left_out
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, State
 from icalib.result import (
@@ -347,9 +347,6 @@ def notes(assessed: AssessedEstimate) -> Iterator[Remark]:
         yield from assessment.notes
 
 
-CLOCK_RATE_SIGMAS = 5.0  # standard deviations from which a clock rate is named
-
-
 def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
     """A note on each clock whose rate differs from that of the body, by more than the time tolerance over the
     recording."""
@@ -358,7 +355,7 @@ def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
     for g in assessed.groups:
         rate, std = (float(x[0]) for x in (g.value, g.std)) if g.name == CLOCK_RATE.name else (0.0, 0.0)
         drift_s = PPM * abs(rate) * duration
-        if g.columns is not None and abs(rate) > CLOCK_RATE_SIGMAS * std and drift_s > rig.settings.time_tolerance_s:
+        if g.columns is not None and abs(rate) > EFFECT_SIGMAS * std and drift_s > rig.settings.time_tolerance_s:
             sentence = (
                 f"the clock of {g.sensor} runs {pace_words(rate, std)} against that of {rig.reference}, "
                 f"{1e3 * drift_s:.2g} ms over the recording; the estimate includes it as clock_rate."

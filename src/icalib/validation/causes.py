@@ -182,14 +182,17 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool)
     for assessment in assessments(assessed):
         yield from assessment.clock_causes
     causes, segments, timeline = list[Cause](), assessed.segments, assessed.timeline
-    by_gain = () if segments is None else changes(segments, assessed.inputs.sensors)
-    clear = None if segments is None else _clear_change(by_gain, scatter(segments))
+    is_amiss = bool(misfit.fits) or scattering
+    by_gain, clear = (), None
+    if segments is not None and (is_amiss or assessed.effects):
+        by_gain = changes(segments, assessed.inputs.sensors)
+        clear = _clear_change(by_gain, scatter(segments))
     if effects := list(effect_causes(assessed, by_gain, clear)):  # the others may follow from these
         yield from effects
         return
     if misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
-    if segments is not None and clear is not None and (misfit.fits or scattering):
+    if segments is not None and clear is not None and is_amiss:
         causes += _change(by_gain, segments, misfit, timeline)
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
@@ -253,7 +256,7 @@ def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -
     others = list(dict.fromkeys(" and ".join(c.sensors) for c in alike if c.sensors != best.sensors))
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.name == TIME_OFFSET.name:
-        return _clock_words(best, others, segments, when, timeline)
+        return _clock_words(best, others, when, timeline)
     changed = [_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
     what = " or ".join(size for size, _ in changed)
     advice = " ".join(dict.fromkeys(against for _, against in changed))
@@ -284,7 +287,7 @@ def _changed(c: Change, segments: Segments) -> tuple[Remark, str]:
     ), "Fasten all mounts."
 
 
-def _clock_words(c: Change, others: list[str], segments: Segments, when: str, timeline: Timeline) -> Remark:
+def _clock_words(c: Change, others: list[str], when: str, timeline: Timeline) -> Remark:
     """A sentence on a time offset that jumps. others: clocks that explain as much."""
     instead = f" (or that of {', or of '.join(others)} the opposite way)" if others else ""
     return Remark(
