@@ -9,6 +9,7 @@ import pytest
 from tests.cases import each
 
 from icalib.optim.arrowhead import make_pieces
+from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import MAX_DISTANCE_M
 from icalib.sensors.camera.tracks import FeatureOutput
@@ -44,9 +45,9 @@ def test_points_come_back_from_near_and_far(factor, setup, times: float):
     np.testing.assert_allclose(there.points, out.points, atol=1e-5)
 
 
-def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
-    """Seen from everywhere in one direction, as a star is, it goes as far as points may, and its cost is that of the
-    star."""
+@pytest.fixture(scope="module")
+def starry(factor, setup) -> tuple[FeatureFactor, int]:
+    """The features, of which one is seen from everywhere in one direction, as a star is; and its track."""
     views = factor._views(setup.state, 0, factor.n_keyframes)
     track = next(t for t in range(factor.tracks.count) if factor.tracks.camera[t] == 0)
     star = views[0].poses.rotation[factor.tracks.image[track]] @ [0.05, 0.02, 1.0]
@@ -59,12 +60,32 @@ def test_a_point_at_infinity_stays_in_its_direction(factor, setup):
         uv = stream.uv.copy()
         uv[own] = seen[stream.image[own]]
         streams[view.index] = replace(stream, uv=uv)
-    distant = replace(factor, streams=tuple(streams))
+    return replace(factor, streams=tuple(streams)), track
+
+
+def test_a_point_at_infinity_stays_in_its_direction(starry, setup):
+    """It goes as far as points may, and its cost is that of the star."""
+    distant, track = starry
     _, out = outcome(distant, setup.state)
-    for view in views:
-        own = np.flatnonzero((factor.tracks.track[view.index] == track) & factor.keep[view.index])
+    for view in distant._views(setup.state, 0, distant.n_keyframes):
+        own = np.flatnonzero((distant.tracks.track[view.index] == track) & distant.keep[view.index])
         assert np.abs(out.residual[view.index][own]).max(initial=0.0) < 0.02
     assert np.linalg.norm(out.points[track]) == pytest.approx(MAX_DISTANCE_M, rel=1e-6)
+
+
+def test_a_point_at_infinity_says_nothing_about_the_axes_of_the_world(starry, setup, dense):
+    """A world that is turned about gravity, with all that is in it, looks the same. A prior on the place of a point at
+    100 km would show its heading to 10 mrad."""
+    distant, state = starry[0], setup.state
+    n = distant.n_keyframes
+    pieces = [distant.attach(p, True) for p in make_pieces(n, setup.layout.size)]
+    for piece in pieces:
+        distant.accumulate(state, piece, distant.output())
+    H, _ = dense(pieces, n)
+    turn, up = np.zeros(len(H)), np.array([0.0, 0.0, 1.0])
+    moved = up @ state.rotation, np.cross(up, state.position), np.cross(up, state.velocity)
+    turn[: KEYFRAME_DIM * n].reshape(n, KEYFRAME_DIM)[:, :9] = np.hstack(moved)
+    assert abs(turn @ H @ turn) < 1e-3
 
 
 def test_coarse_noise_is_as_large_as_most_errors_and_no_less_than_stated(factor, setup):

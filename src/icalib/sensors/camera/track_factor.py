@@ -65,7 +65,10 @@ from icalib.sensors.camera.tracks import (
 )
 
 MAX_POINT_STEPS = 20  # of Levenberg-Marquardt for a point; most points converge in three
-MIN_POINT_INFORMATION = 1e-6  # 1/m^2, a prior of 1 km: a point without observations stays invertible
+# Prior of 1 km on a point's distance [1/m^2] and of 1000 rad on its direction [1/rad^2] from its anchor camera: a point
+# without observations stays invertible. A prior on its place in the world would tie the tilt of the world to a point
+# whose distance is unobservable, and that may be 100 km away.
+MIN_POINT_INFORMATION = 1e-6
 MAX_TRACK_GAP_S = 1.0  # a feature that is unobserved for longer begins a new track
 MAX_RELATIVE_SIGMA = 0.1  # standard deviation of a point over its distance, above which its track is left out
 MAX_RESIDUAL_RATIO = 10.0  # to the RMS residual of the median track, above which a track is left out
@@ -247,7 +250,10 @@ class FeatureFactor(FactorDefaults):
         features = NO_SUMS
         if sums and piece.features is not None:
             features = piece.features.sums
-            features.diagonal[:, range(3), range(3)] += MIN_POINT_INFORMATION
+            ray = points.xyz - points.anchor
+            square = np.maximum((ray**2).sum(axis=1), 1e-18)[:, None, None]
+            along = ray[:, :, None] * ray[:, None, :] / square
+            features.diagonal[:] += MIN_POINT_INFORMATION * (along + (np.eye(3) - along) / square)
         total, begin = 0.0, 0
         for view in views:
             i, loss = view.index, self._loss(curved)
