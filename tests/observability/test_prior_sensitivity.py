@@ -174,6 +174,16 @@ def test_a_step_along_which_nothing_can_be_solved_leaves_the_linear_response(giv
     assert not found[2:].any()
 
 
+def test_what_the_data_do_not_show_away_from_the_solution_does_not_respond(given):
+    """More noise is taken off there than is left. A floor of the information made the coupling 1e4 times as large."""
+    factors, noise = module._factors(given.outcome, given.state), np.zeros((8, 8))
+    errors = given.problem.fixed_directions
+    noise[5, 5] = 1.5
+    noise[5, [0, 4]] = noise[[0, 4], 5] = 0.3
+    shifts = module._response(factors, noise, errors) / given.problem.tolerance[:, None]
+    np.testing.assert_allclose(shifts, errors, atol=1e-12)
+
+
 @pytest.mark.parametrize("why", ["all are fixed", "the estimate failed"])
 def test_without_a_response_only_the_fixed_directions_move(given, monkeypatch, why: str):
     if why == "all are fixed":

@@ -29,9 +29,8 @@ from icalib.optim.arrowhead import (
     Factors,
     NotDefiniteError,
     Solution,
-    restricted_inverse,
+    free_root,
     restricted_root,
-    solve,
     sums_of_priors,
 )
 from icalib.optim.state import Block, Key, Layout, State
@@ -125,16 +124,21 @@ def _factors(outcome: Outcome, state: State) -> Factors:
     """The factorised normal equations of `outcome` at `state`; overwrites its workspace."""
     problem, pieces = outcome.problem, outcome.workspace or outcome.problem.pieces()
     problem.linearise(state, pieces, problem.residuals(), curved=True)
-    return solve(pieces, problem.n_keyframes, problem.tolerance, fixed_directions=problem.fixed_directions).factors
+    return problem.solve(pieces).factors
 
 
 def _response(factors: Factors, noise: np.ndarray, errors: np.ndarray) -> np.ndarray:
     """(B, m) change of all calibration parameters, in their units, with `errors` (B, m) along the fixed directions, by
-    the implicit function theorem. noise (B, B): information that noise in the Jacobian adds; both in tolerance
-    units."""
+    the implicit function theorem. noise (B, B): information that noise in the Jacobian adds; both in tolerance units.
+
+    Directions that are unobservable at this state do not respond, as in a step of the solver. Away from the solution,
+    less noise may be left than is subtracted, and a floor of the information would make any coupling 1e4 times as
+    large."""
     t = factors.tolerance[:, None]
     known = t * factors.information * t.T - noise
-    return t * (errors - restricted_inverse(known, factors.fixed_directions) @ (known @ errors))
+    free, root = free_root(known, np.ones(len(known)), factors.fixed_directions, factors.essential)
+    axes = free @ root
+    return t * (errors - axes @ (axes.T @ (known @ errors)))
 
 
 def _guess_errors(inputs: Inputs, outcome: Outcome, data: np.ndarray) -> np.ndarray:

@@ -53,12 +53,12 @@ def calib_step(
     UNOBSERVABLE_BELOW of the information of the essential parameters in units of `tolerance` (B,). Nuisance parameters
     count as known there: their priors bound a direction that only they move.
     """
-    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    free, root = free_root(information, tolerance, fixed_directions, essential)
     projected = root.T @ (free.T @ (tolerance * gradient))
     return -tolerance * (free @ (root @ projected)), float(0.5 * projected @ projected)
 
 
-def _free_root(
+def free_root(
     information: np.ndarray, tolerance: np.ndarray, fixed_directions: np.ndarray, essential: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Orthonormal directions (B, n) that are not fixed, and a root (n, k) of the inverse of the information within
@@ -120,7 +120,7 @@ def calib_draws(
 ) -> np.ndarray:
     """Draws (B, m) with the inverse information as covariance, from standard normal numbers `white` (B, m). Directions
     that `calib_step` fixes are zero. The root of the covariance is symmetric: signs of eigenvectors do not matter."""
-    free, root = _free_root(information, tolerance, fixed_directions, essential)
+    free, root = free_root(information, tolerance, fixed_directions, essential)
     axes = free @ root
     return tolerance[:, None] * (axes @ ((axes / np.linalg.norm(axes, axis=0)).T @ white))
 
