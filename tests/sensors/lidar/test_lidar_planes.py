@@ -22,7 +22,7 @@ from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.imu.spec import class_noise
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.initialize.association import (
-    ASSOCIATION_ROUNDS,
+    LAST_ROUND,
     associate,
     check_opaque,
     check_shares,
@@ -72,7 +72,7 @@ def solved(r, state, found):
     return outcome.state
 
 
-def calibrated(r, rounds=ASSOCIATION_ROUNDS):
+def calibrated(r, rounds=LAST_ROUND + 1):
     """The state after the rounds, and the associations of all of them."""
     state, found = guessed(r), []
     for k in range(rounds):

@@ -24,6 +24,7 @@ from icalib.errors import EstimationError
 from icalib.estimate.estimate import first_pass
 from icalib.estimate.inputs import Inputs, with_association
 from icalib.estimate.problem import keyframe_times, keyframes_for, motion_of, start_values
+from icalib.geometry import so3
 from icalib.geometry.planes import plane_of
 from icalib.initialize.initializer import (
     KnownExtrinsics,
@@ -42,6 +43,7 @@ from icalib.initialize.initializer import (
 from icalib.motion.point_planes import PlaneAssociation, are_somewhere, count_points, joined_associations, thinned
 from icalib.motion.poses import EstimatedMotion, are_near_keyframes, instants, sweep
 from icalib.optim.state import Key, State
+from icalib.rig import Rig
 from icalib.sensors.lidar.binning import (
     COARSE_BIN_S,
     AssociatedPoints,
@@ -56,6 +58,7 @@ from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_o
 from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
 from icalib.sensors.lidar.residual import less_offset
+from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 # The rounds diverge if the share of points on planes falls below both: a share of all points, and a ratio to the share
@@ -122,27 +125,27 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
 
 
 def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
-    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points. They are
-    repeated where the guess is so far off that they have not converged."""
+    """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points. A round is
+    repeated where its solve turns a LiDAR by more than the round assumed the state to be off."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars), MOST_EARLY_POINTS)
     fewer = _thinned_inputs(inputs, step)
     associations: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
-    shares = []
-    for _ in range(MOST_TIMES):
-        for k in range(ASSOCIATION_ROUNDS - 1):
-            fewer, state, associations = _associated(fewer, state, k, associations)
-            shares.append(_share_on_planes(fewer.association))
-            state = first_pass(fewer, state)
-        if shares[-1] > MIN_LAST_SHARE:
+    shares, k = [], 0
+    for _ in range(MOST_EARLY_ROUNDS):
+        fewer, state, associations = _associated(fewer, state, k, associations)
+        shares.append(_share_on_planes(fewer.association))
+        before, state = state, first_pass(_less_certain(fewer, k), state)
+        k += _turned(inputs.rig, before, state) < STATE_ERRORS[k]
+        if k == LAST_ROUND:
             break
-    before = [
+    early = [
         _unthinned(a, streams, first, step)
         for a, streams, first in zip(associations, recordings, _first_points(recordings), strict=True)
     ]
-    inputs, state, associations = _associated(inputs, state, ASSOCIATION_ROUNDS - 1, before)
+    inputs, state, associations = _associated(inputs, state, LAST_ROUND, early)
     names = " and ".join(s.name for s in inputs.measurements.lidars)
     check_shares([*shares, _share_on_planes(inputs.association)], names)
-    if inputs.rig.assumes_motion:
+    if inputs.rig.assumes_motion and isinstance(inputs.rig.sensors[inputs.rig.reference_without_imu], Lidar):
         check_opaque(max(a.doubled for a in associations), names)
     return inputs, state
 
@@ -162,6 +165,25 @@ def _associated(
     planes = np.concatenate([a.planes for a in associations])
     values = _without_planes(state) | dict(zip(association.keys, planes, strict=True))
     return with_association(inputs, association), replace(state, values=values), associations
+
+
+def _less_certain(inputs: Inputs, k: int) -> Inputs:
+    """The inputs with the registration error of round k as a part of the noise of points. Surfaces that are flat to
+    within this error, and not to within the noise, do not bend the trajectory."""
+
+    def noisier(lidar: Lidar, stream: LidarStream) -> Lidar:
+        distance = float(np.sqrt((stream.xyz**2).sum(axis=1).mean()))
+        noise = lidar.range_noise_m or FIRST_RANGE_SIGMA_M
+        return replace(lidar, range_noise_m=float(np.hypot(noise, STATE_ERRORS[k] * np.hypot(1.0, distance))))
+
+    lidars = zip(inputs.rig.lidars, inputs.measurements.lidars, strict=True)
+    return replace(inputs, rig=inputs.rig.with_(lidars=tuple(noisier(*x) for x in lidars)))
+
+
+def _turned(rig: Rig, before: State, after: State) -> float:
+    """Largest rotation [rad] between the attitudes of a LiDAR in two states."""
+    keys = [(x.name, "rotation") for x in rig.lidars]
+    return max(float(np.linalg.norm(so3.log(np.ascontiguousarray(before.values[k].T @ after.values[k])))) for k in keys)
 
 
 def _thinned_inputs(inputs: Inputs, step: int) -> Inputs:
@@ -333,12 +355,10 @@ def points_by_recording(inputs: Inputs) -> list[tuple[LidarStream, ...]]:
 MOST_TRACED = 20_000  # points whose beams are traced: a share of 1 % has a standard deviation of 0.1 %
 # Points of all rounds but the last, at most: with 2 million the result moves by 0.05 sigma, at twice the time.
 MOST_EARLY_POINTS = 500_000
-ASSOCIATION_ROUNDS = 4
-# Times that all rounds but the last run, at most, while few points lie on planes. A guess that was 8 deg off about each
-# axis was still 2.5 deg off after the first time, and points were on wrong planes.
-MOST_TIMES = 2
 # Assumed error of the state in each round: position [m], and rotation about the sensor [rad].
 STATE_ERRORS = (0.03, 0.01, 0.003, 0.001)
+LAST_ROUND = len(STATE_ERRORS) - 1
+MOST_EARLY_ROUNDS = 10  # a guess 8 deg off about each axis takes six
 MIN_PLANE_POINTS = 100  # points of a plane: with fewer, its normal is too uncertain to be of use
 MIN_KEPT_POINTS = 0.5  # share of the associated points of a plane from the old plane whose name it keeps
 
@@ -360,7 +380,7 @@ class AssociatedPlanes:
 
 def round_search(k: int, noise_m: float) -> PlaneSearch:
     """Tolerances of the plane search in round k, counted from 0. noise_m: standard deviation of a point [m]."""
-    error = STATE_ERRORS[min(k, len(STATE_ERRORS) - 1)]
+    error = STATE_ERRORS[k]
     return PlaneSearch(noise_m=noise_m, position_m=error, angle_rad=error)
 
 
