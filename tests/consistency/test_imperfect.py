@@ -44,6 +44,30 @@ def test_effects_of_two_sigma_are_within_four_printed_ones(program: ModuleType, 
     assert (row.converged, row.failures, row.far) == (1, (), False), row
 
 
+@pytest.mark.parametrize(
+    ("kind", "effect", "largest"),
+    [
+        ("camera + IMU", "gyroscope scale", "gyro_zz"),
+        ("poses + IMU", "accelerometer rotation", "accel_rotation_z"),
+        ("poses + IMU", "none", ""),
+        pytest.param("tracks + IMU", "gyroscope misalignment", "gyro_yx", marks=pytest.mark.full),
+        pytest.param("LiDAR + IMU", "accelerometer scale", "accel_zz", marks=pytest.mark.full),
+        pytest.param("LiDAR + IMU", "none", "", marks=pytest.mark.full),
+        pytest.param("wheels + poses + IMU", "accelerometer misalignment", "accel_yx", marks=pytest.mark.full),
+        pytest.param("wheels + poses + IMU", "none", "", marks=pytest.mark.full),
+    ],
+)
+def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind: str, effect: str, largest: str):
+    scenario = program.with_effect(program.KINDS[kind].scenario(), effect, 1.0, 1)
+    rig = program.rig_of(scenario, program.KINDS[kind])
+    rig = rig.with_(imu=replace(rig.imu, intrinsics=Parameter("fixed")))
+    reasons = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated()).reasons
+    if largest:
+        assert reasons[0].name == "imu_not_ideal"
+        assert f"most of all {largest} is" in reasons[0]
+    assert not [r for r in reasons if r.name == "residuals_unexplained" or (not largest and r.name == "imu_not_ideal")]
+
+
 @pytest.mark.full
 def test_taken_for_ideal_such_an_imu_is_far_off(program: ModuleType):
     """Or the test above could not fail."""

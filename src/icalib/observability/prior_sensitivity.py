@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
@@ -271,7 +272,10 @@ class Relaxed:
         fixed_directions = (
             np.hstack([fixed, self.problem.fixed_directions]) if self.problem.fixed_directions.size else fixed
         )
-        return _newton_step(self.solution.information - known, self.solution.gradient[:-1] - pull, t, fixed_directions)
+        step, root = _newton_step(
+            self.solution.information - known, self.solution.gradient[:-1] - pull, t, fixed_directions
+        )
+        return step, np.sqrt((root**2).sum(axis=1))
 
     def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
         """The outcome without the priors on the groups `freed`, and the gradient (B,) of the calibration parameters.
@@ -290,10 +294,10 @@ class Relaxed:
 def _newton_step(
     information: np.ndarray, gradient: np.ndarray, t: np.ndarray, fixed_directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(B,) step of the calibration parameters for their information (B, B) and gradient (B,), and (B,) its standard
-    deviations. fixed_directions (B, m): in units of the tolerances t (B,)."""
-    root = restricted_root(t[:, None] * information * t, fixed_directions)
-    return -t * (root @ (root.T @ (t * gradient))), t * np.sqrt((root**2).sum(axis=1))
+    """(B,) step of the calibration parameters for their information (B, B) and gradient (B,), and a root (B, n) of its
+    covariance. fixed_directions (B, m): in units of the tolerances t (B,)."""
+    root = t[:, None] * restricted_root(t[:, None] * information * t, fixed_directions)
+    return -root @ (root.T @ gradient), root
 
 
 def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
@@ -379,59 +383,94 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
     return out
 
 
-# Effects that the estimate leaves out: parameters that are zero, and not estimated, by default.
+# Effects that the estimate leaves out: parameters that are zero, as sensors are ideal, and not estimated.
 
-EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero
+EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero; with several numbers, as unlikely
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect of the whole recording, such as the rate of a clock, by a score test. value: one Newton step of its
-    parameter [the unit of `spec`], beside all other effects that were tested; std: its standard deviation, by the
-    scatter of segments after this step."""
+    """An effect of the whole recording, such as the rate of a clock, by a score test. value (m,): one Newton step of
+    its parameters [the unit of `spec`], beside all other effects that were tested; std (m,): its standard deviations,
+    by the scatter of segments after this step; chi2: of the step, so scattered; gain: decrease of chi^2 where it is
+    estimated; moves: the largest change of another parameter, in tolerances."""
 
     sensor: str
     spec: ParameterSpec
-    value: float
-    std: float
+    value: np.ndarray
+    std: np.ndarray
+    chi2: float
+    gain: float
+    moves: float
 
     @property
-    def gain(self) -> float:
-        """Decrease of chi^2 where it is estimated."""
-        return (self.value / self.std) ** 2
+    def differs(self) -> bool:
+        """Whether it differs from zero."""
+        return self.chi2 > _least_chi2(len(self.value))
 
     def amended(self, rig: Rig) -> Rig:
         """The rig with a prior on the effect, so that it is estimated."""
-        prior = Parameter("prior", np.zeros(1), np.full(1, self.prior_sigma))
-        effect = (self.sensor, self.spec.name)
-        return with_groups(rig, lambda sensor, name, p: prior if (sensor.name, name) == effect else p)
+        prior = Parameter("prior", np.zeros(self.spec.size), np.full(self.spec.size, self.prior_sigma))
+        return rig.with_sensors(replace(rig.sensors[self.sensor], **{self.spec.name: prior}))
 
     @property
     def prior_sigma(self) -> float:
         """Standard deviation of the prior with which it is estimated: the next power of ten, or the usual one."""
-        return max(float(10.0 ** np.ceil(np.log10(abs(self.value)))), self.spec.prior_sigma)
+        return max(float(10.0 ** np.ceil(np.log10(np.abs(self.value).max()))), self.spec.prior_sigma)
 
 
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
-    """All effects that the rig file does not mention, tested together; none without convergence, or if none differs
-    from zero."""
-    tested = {
-        (s.name, spec.name): spec
-        for s in inputs.rig.mounted
-        for spec in s.specs()
-        if spec.is_effect and (p := getattr(s, spec.name)).mode == "fixed" and p.value is None
-    }
-    freed = _treated(inputs, lambda s, name, p: Parameter() if (s.name, name) in tested else p)
-    columns = {key: freed.layout.columns(*key)[0] for key in tested if freed.layout.is_free(*key)}
-    if not (columns and estimate.outcome.converged) or (linearised := _linearised(freed, estimate, tested)) is None:
+    """All effects that the rig file does not mention, and imperfections that it excludes, tested together; none without
+    convergence, or if none differs from zero."""
+    rig, tested = inputs.rig, {}
+    for s in rig.sensors.values() if estimate.outcome.converged else ():
+        for spec in () if rig.assumes_motion and s is rig.imu else (x for x in s.specs() if x.is_effect):
+            if (p := getattr(s, spec.name)).mode == "fixed" and p.value is None:
+                tested[s.name, spec.name] = spec
+    freed, unknown = _with_effects(inputs, tested), [key for key, spec in tested.items() if spec.size == 1]
+    columns = {key: freed.layout.columns(*key) for key in tested if freed.layout.is_free(*key)}
+    if not columns or (linearised := _linearised(freed, estimate, unknown)) is None:
         return ()
     problem, state, solution, residuals = linearised
-    step, std = _newton_step(solution.information, solution.gradient[:-1], problem.tolerance, problem.fixed_directions)
-    if all(abs(step[k]) < EFFECT_SIGMAS * std[k] for k in columns.values()):
+    gradient, t = solution.gradient[:-1], problem.tolerance
+    step, root = _newton_step(solution.information, gradient, t, problem.fixed_directions)
+    gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
+    if all(gain[key] < _least_chi2(len(k)) for key, k in columns.items()):
         return ()
     outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
-    if (parts := Segments.of(problem, outcome, inputs.rig.settings.segments)) is not None:
+    std = np.sqrt((root**2).sum(axis=1))
+    ratio = np.ones(len(step))
+    if (parts := Segments.of(problem, outcome, rig.settings.segments)) is not None:
         scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
-        std = np.maximum(std, np.sqrt(scattered))
-    return tuple(Effect(key[0], tested[key], float(step[k]), float(std[k])) for key, k in columns.items())
+        ratio = np.maximum(1.0, np.sqrt(scattered) / std)
+    others = np.setdiff1d(problem.layout.essential, np.concatenate(list(columns.values())))
+    moves = float((np.abs(step[others]) / t[others]).max(initial=0.0))
+    return tuple(
+        Effect(key[0], tested[key], step[k], (ratio * std)[k], _chi2(step[k] / ratio[k], root[k]), gain[key], moves)
+        for key, k in columns.items()
+    )
+
+
+def _chi2(step: np.ndarray, root: np.ndarray) -> float:
+    """chi^2 of a step (m,) whose covariance has the root (m, n)."""
+    return float(((np.linalg.pinv(root) @ step) ** 2).sum())
+
+
+def _least_chi2(m: int) -> float:
+    """The chi^2 of m numbers that is as unlikely as EFFECT_SIGMAS standard deviations of one."""
+    return float(stats.chi2.isf(stats.chi2.sf(EFFECT_SIGMAS**2, 1), m))
+
+
+def _with_effects(inputs: Inputs, tested: Collection[Key]) -> Inputs:
+    """The inputs with the groups `tested` estimated: with the prior of their class, or without one."""
+
+    def default(sensor: Sensor, name: str) -> Parameter:
+        usual: Parameter = getattr(type(sensor), name)
+        return Parameter() if usual.mode == "fixed" else usual
+
+    of_sensors: dict[str, dict[str, Parameter]] = {}
+    for sensor, name in tested:
+        of_sensors.setdefault(sensor, {})[name] = default(inputs.rig.sensors[sensor], name)
+    changed = (replace(inputs.rig.sensors[name], **groups) for name, groups in of_sensors.items())
+    return with_association(replace(inputs, rig=inputs.rig.with_sensors(*changed)), inputs.association)

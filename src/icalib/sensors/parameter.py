@@ -183,7 +183,8 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
-    explains it. is_effect: zero, and estimated only if the recording shows otherwise. starts_at_zero: needs no guess.
+    explains it. is_effect: zero of an ideal sensor; whether it is is tested where it is not
+    estimated. starts_at_zero: needs no guess.
     by_images: determined by images, not by motion. motion: advice if the data do not determine the group; {axes} stands
     for the axes about which the rig hardly turned. motion_on_wheels, motion_without_target and motion_at_rest replace
     `motion` for rigs on wheels, without target, and where nothing connects the instants.

@@ -18,7 +18,7 @@ from icalib.motion.factor import FitKey
 from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Cause, Remedy, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
-from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, Relaxed, relaxed
+from icalib.observability.prior_sensitivity import Relaxed, relaxed
 from icalib.optim.state import Key
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
@@ -26,7 +26,7 @@ from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ra
 from icalib.result.verdict import AUXILIARY
 from icalib.rig import ImuSensor, Rig
 from icalib.sensors.imu.assess import quiet_scatter
-from icalib.sensors.sensor import TIME_OFFSET
+from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET
 from icalib.validation.guesses import (
     absurd_values,
     felt_size,
@@ -210,16 +210,16 @@ def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: 
     rig = assessed.inputs.user_rig or assessed.inputs.rig
     duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
     for e in assessed.effects:
-        differs = abs(e.value) > EFFECT_SIGMAS * e.std or e.sensor in drifting
-        if differs and (e.sensor,) not in jumping:
-            late_s = PPM * abs(e.value) * duration
+        rate = float(e.value[0])
+        if e.spec is CLOCK_RATE and (e.differs or e.sensor in drifting) and (e.sensor,) not in jumping:
+            late_s = PPM * abs(rate) * duration
             sentence = (
-                f"the clock of {e.sensor} runs about {pace_words(e.value)} against that of {rig.reference}, "
+                f"the clock of {e.sensor} runs about {pace_words(rate)} against that of {rig.reference}, "
                 f"{1e3 * late_s:.2g} ms over the recording. Write clock_rate: {{prior: 0, sigma: "
                 f"{e.prior_sigma:.0f}}}, and leave time_offset free; or stamp all sensors by one clock, and "
                 "record again."
             )
-            remedy = Remedy(e.amended) if abs(e.value) < LIKELY * e.spec.prior_sigma else None
+            remedy = Remedy(e.amended) if abs(rate) < LIKELY * e.spec.prior_sigma else None
             grave = late_s > LARGE * rig.settings.time_tolerance_s
             yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=remedy)
 

@@ -12,12 +12,12 @@ from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.motion.imu_data import further_imu_data
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.mounted_factor import SPEED_SIGMA_M_S
-from icalib.sensors.imu.spec import INTRINSICS_LABELS, prior_words
+from icalib.sensors.imu.spec import INTRINSICS, INTRINSICS_LABELS, prior_words
 from icalib.sensors.imu.stream import ImuResiduals
 
 
@@ -92,6 +92,19 @@ def _intrinsics_words(imu: ImuSensor) -> Remark | None:
     )
 
 
+def causes(a: AssessedEstimate) -> Iterator[Cause]:
+    """A cause for each IMU whose intrinsics are fixed at those of an ideal one, and are others."""
+    for e in a.effects:
+        if e.spec is INTRINSICS and e.differs:
+            k = int(np.argmax(np.abs(e.value / e.std)))
+            sentence = (
+                f"{e.sensor} is not ideal, as intrinsics: fixed says: most of all {INTRINSICS_LABELS[k]} is about "
+                f"{e.value[k]:.2g} +- {e.std[k]:.2g}. Remove intrinsics of {e.sensor} in the rig file, so that they "
+                "are estimated."
+            )
+            yield Cause(Remark("imu_not_ideal", sentence), e.gain, e.moves > 1.0)
+
+
 def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> Remark | None:
     """Always None: `validation` tests the noise of the IMU separately, as all other sensors depend on it."""
     return None
@@ -129,6 +142,7 @@ def assess(a: AssessedEstimate) -> Assessment:
     return Assessment(
         residuals=residuals(a.inputs, a.estimate, a.timeline),
         notes=notes(a.inputs, a.timeline),
+        causes=causes(a),
     )
 
 

@@ -76,6 +76,7 @@ INTRINSICS_LABELS = (
     *(f"g_sensitivity_{a}{b}" for a in "xyz" for b in "xyz"),
 )
 N_INTRINSICS = len(INTRINSICS_LABELS)
+INTRINSICS = ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1, is_effect=True)
 SIZE_EFFECT = ParameterSpec("size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
@@ -175,7 +176,7 @@ class ImuSensor(MountedSensor):
     is_inertial: ClassVar[bool] = True
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (
         *MOUNTED,
-        ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1),
+        INTRINSICS,
         SIZE_EFFECT,
     )
 
