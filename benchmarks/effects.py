@@ -154,6 +154,7 @@ def rig_of(scenario: Scenario, kind: Kind) -> Rig:
         imu=replace(rig.imu, intrinsics=prior) if kind.imu else None,
         target=target,
         poses=tuple(replace(p, scale_sigma=PoseSensor.scale_sigma) for p in rig.poses),
+        lidars=tuple(replace(x, range_scale=Parameter("fixed")) for x in rig.lidars),
         settings=replace(rig.settings, segments=8),
     )
 

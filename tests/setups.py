@@ -43,6 +43,7 @@ from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenari
 
 TOLERANCE = {
     "range_offset": 5e-3,
+    "range_scale": 1e-2,
     "gravity": 0.01,
     "rotation": 2e-3,
     "translation": 5e-3,
@@ -355,6 +356,7 @@ def make_room(
     entries.append((stream.name, "time_offset", "vector", 1, True))
     entries.append((stream.name, "clock_rate", "vector", 1, drifts))
     entries.append((stream.name, "range_offset", "vector", 1, sheet))
+    entries.append((stream.name, "range_scale", "vector", 1, sheet or drifts))
     if sheet:
         assert used[0] == 0, "the first face of a room is its floor"
         planes = ((BOARD, "tilt"), *planes[1:])
@@ -363,7 +365,7 @@ def make_room(
     T, origin_s = truth.T_imu_sensor[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
     values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
-    values[stream.name, "range_offset"], values[stream.name, "clock_rate"] = np.zeros(1), np.zeros(1)
+    values |= {(stream.name, name): np.zeros(1) for name in ("range_offset", "range_scale", "clock_rate")}
     values[stream.name, MIDDLE] = stream.seconds[-1:] / 3.0
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
     faces = not_none(sim.scenario.room).faces

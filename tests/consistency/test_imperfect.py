@@ -13,8 +13,9 @@ from tests.typed import not_none
 from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.sensors.imu.spec import class_imperfections
+from icalib.sensors.lidar.simulate import SimLidar
 from icalib.sensors.pose.simulate import SimPoses
-from icalib.tools.simulation import handheld, rig_for, simulate
+from icalib.tools.simulation import Scenario, handheld, rig_for, simulate
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +67,38 @@ def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind:
         assert reasons[0].name == "imu_not_ideal"
         assert f"most of all {largest} is" in reasons[0]
     assert not [r for r in reasons if r.name == "residuals_unexplained" or (not largest and r.name == "imu_not_ideal")]
+
+
+def poses_and_lidar(program: ModuleType, scale: float) -> Scenario:
+    """Of `scale`, the ratio of true to reported ranges."""
+    scenario = program.lidar_imu()
+    lidars = tuple(replace(x, azimuth_steps=225, scale=scale) for x in scenario.of(SimLidar))
+    return replace(scenario, sensors=(*lidars, *program.poses_imu().sensors))
+
+
+@pytest.mark.parametrize("exact", [False, True])
+def test_lengths_carry_the_uncertainty_of_ranges(program: ModuleType, exact: bool):
+    """The scale of motion capture follows from ranges that are 0.3 % too long."""
+    scenario = poses_and_lidar(program, 1.0 / 1.003)
+    rig = program.rig_of(scenario, program.Kind(lambda: scenario, True, ()))
+    if exact:
+        rig = rig.with_(lidars=tuple(replace(x, range_scale=Parameter("fixed", np.zeros(1))) for x in rig.lidars))
+    result = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated())
+    scale = result.group("mocap0", "scale")
+    off = abs(float(scale.value[0]) - 1.0) / float(scale.std[0])
+    assert off > 30.0 if exact else off < 4.0
+
+
+def test_a_scale_of_ranges_is_found(program: ModuleType):
+    scenario = poses_and_lidar(program, 1.01)
+    rig = program.rig_of(scenario, program.Kind(lambda: scenario, True, ()))
+    result = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated())
+    scale = result.group("lidar0", "range_scale")
+    assert abs(scale.value[0] - (1.0 / 1.01 - 1.0)) < 3.0 * scale.std[0] < 4e-3
+    assert "range_scale_estimated" in [note.name for note in result.notes]
+    assert (
+        max(off for _, verdict, off in program.errors(result, simulate(scenario, 1)) if verdict == "determined") < 4.0
+    )
 
 
 @pytest.mark.full

@@ -486,7 +486,9 @@ def lidar_rows_turned(factor, at, turn):
     distance = np.column_stack([distance, np.einsum("eba,eb->ea", R_lidar[bin_of], normal)])
     L = np.zeros((len(plane), 4, 4))
     L[:, *np.tril_indices(4)] = m.root
-    too_far = at.values[name, "range_offset"][0] - factor.range_offset
+    (offset, scale), before = (at.values[name, x][0] for x in ("range_offset", "range_scale")), factor.range_errors
+    too_far = (offset - before[0]) / (1.0 + before[1])
+    distance[:, 0] *= (1.0 + scale) / (1.0 + before[1])
     for e in np.flatnonzero([factor.planes[q][1] == "tilt" for q in m.plane]):  # x - too_far x / |x| at their mean
         mean, a = L[e, 1:, 0] / L[e, 0, 0], distance[e, 1:].copy()
         r = np.linalg.norm(mean)

@@ -8,9 +8,10 @@ changes with the square of their roll.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -420,24 +421,34 @@ class Effect:
         return max(float(10.0 ** np.ceil(np.log10(np.abs(self.value).max()))), self.spec.prior_sigma)
 
 
-def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
+class LeftOut(NamedTuple):
+    """Effects that an estimate leaves out: all that were tested, none where none differs from zero; and shifts (n, B)
+    of the calibration parameters whose outer products add to their covariance, for those that nothing determines."""
+
+    tested: tuple[Effect, ...]
+    shifts: np.ndarray
+
+
+def effects_left_out(inputs: Inputs, estimate: Estimate) -> LeftOut:
     """All effects that the rig file does not mention, and imperfections that it excludes, tested together; none without
-    convergence, or if none differs from zero."""
-    rig, tested = inputs.rig, {}
+    convergence."""
+    rig, specs = inputs.rig, dict[Key, ParameterSpec]()
     for s in rig.sensors.values() if estimate.outcome.converged else ():
         for spec in () if rig.assumes_motion and s is rig.imu else (x for x in s.specs() if x.is_effect):
             if (p := getattr(s, spec.name)).mode == "fixed" and p.value is None:
-                tested[s.name, spec.name] = spec
-    freed, unknown = _with_effects(inputs, tested), [key for key, spec in tested.items() if spec.size == 1]
-    columns = {key: freed.layout.columns(*key) for key in tested if freed.layout.is_free(*key)}
-    if not columns or (linearised := _linearised(freed, estimate, unknown)) is None:
-        return ()
+                specs[s.name, spec.name] = spec
+    freed = _with_effects(inputs, specs)
+    specs = {key: spec for key, spec in specs.items() if freed.layout.is_free(*key)}
+    unknown = [key for key, spec in specs.items() if spec.size == 1]
+    if not specs or (linearised := _linearised(freed, estimate, unknown)) is None:
+        return LeftOut((), np.zeros((0, inputs.layout.size)))
     problem, state, solution, residuals = linearised
-    gradient, t = solution.gradient[:-1], problem.tolerance
-    step, root = _newton_step(solution.information, gradient, t, problem.fixed_directions)
+    step, root = _newton_step(solution.information, solution.gradient[:-1], problem.tolerance, problem.fixed_directions)
+    shifts = _considered(inputs.layout, problem, solution.information, (specs, step, root))
+    columns = {key: freed.layout.columns(*key) for key in specs}
     gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
     if all(gain[key] < _least_chi2(len(k)) for key, k in columns.items()):
-        return ()
+        return LeftOut((), shifts)
     outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
     std = np.sqrt((root**2).sum(axis=1))
     ratio = np.ones(len(step))
@@ -445,11 +456,38 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> tuple[Effect, ...]:
         scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
         ratio = np.maximum(1.0, np.sqrt(scattered) / std)
     others = np.setdiff1d(problem.layout.essential, np.concatenate(list(columns.values())))
-    moves = float((np.abs(step[others]) / t[others]).max(initial=0.0))
-    return tuple(
-        Effect(key[0], tested[key], step[k], (ratio * std)[k], _chi2(step[k] / ratio[k], root[k]), gain[key], moves)
+    moves = float((np.abs(step[others]) / problem.tolerance[others]).max(initial=0.0))
+    tested = tuple(
+        Effect(key[0], specs[key], step[k], (ratio * std)[k], _chi2(step[k] / ratio[k], root[k]), gain[key], moves)
         for key, k in columns.items()
     )
+    return LeftOut(tested, shifts)
+
+
+def _considered(
+    layout: Layout,
+    problem: Problem,
+    information: np.ndarray,
+    found: tuple[Mapping[Key, ParameterSpec], np.ndarray, np.ndarray],
+) -> np.ndarray:
+    """(n, B) responses of the calibration parameters of `layout` to effects that are considered (Schmidt 1966), each as
+    large as its prior and the data together let it be. found: effects, their step and the root of its covariance in the
+    larger layout of `problem`, with `information`."""
+    specs, step, root = found
+    t, n = problem.tolerance, problem.layout.size
+    effects = np.concatenate([problem.layout.columns(*key) for key in specs])
+    known = np.hstack([problem.fixed_directions.reshape(n, -1), np.eye(n)[:, effects]])
+    fixed = t[:, None] * restricted_root(t[:, None] * information * t, known)
+    rows = [np.zeros((0, layout.size))]
+    for key in (key for key, spec in specs.items() if spec.is_considered):
+        k = problem.layout.columns(*key)[0]
+        by_data, by_prior = float((root[k] ** 2).sum()), specs[key].prior_sigma ** 2
+        weight = by_prior / (by_prior + by_data)
+        response, row = -fixed @ (fixed.T @ information[:, k]), np.zeros((1, layout.size))
+        for block in layout.free:
+            row[0, block.columns] = response[problem.layout.block(*block.key).columns]
+        rows.append(row * np.sqrt(weight * by_data + (weight * step[k]) ** 2))
+    return np.vstack(rows)
 
 
 def _chi2(step: np.ndarray, root: np.ndarray) -> float:

@@ -227,8 +227,12 @@ def plane_value(value: np.ndarray) -> np.ndarray:
 
 class Planes(NamedTuple):
     """P planes in the world: unit normal (P, 3), its derivatives (P, 2, 3) by the first two parameters, and a point
-    (P, 3) on each [m]. columns (P, 3): calibration columns, -1 where fixed. The third parameter is the distance; for
-    the target, is_target (P,) bool, it is what a LiDAR measures too much, range_offset [m]."""
+    (P, 3) on each [m]. columns (P, 3 or 4): calibration columns, -1 where fixed. The third parameter is the distance;
+    for the target, is_target (P,) bool, it is what a LiDAR measures too much. The fourth is the scale of its ranges.
+
+    Of points x of the LiDAR, true ones are (x - range_offset x / |x|) / (1 + range_scale). range_unit: derivative of
+    both by these parameters.
+    """
 
     normal: np.ndarray
     tangents: np.ndarray
@@ -236,11 +240,19 @@ class Planes(NamedTuple):
     columns: np.ndarray
     is_target: np.ndarray
     range_offset: float
+    range_scale: float
+    range_unit: float
 
     @classmethod
-    def of(cls, keys: tuple[Key, ...], state: State, columns: np.ndarray, range_offset: float = 0.0) -> Planes:
+    def of(
+        cls,
+        keys: tuple[Key, ...],
+        state: State,
+        columns: np.ndarray,
+        ranges: tuple[float, float, float] = (0.0, 0.0, 1.0),
+    ) -> Planes:
         """Planes, or tilts of the target, with the keys `keys` and their values in `state`. A tilt turns its plane
-        about x and y of the world."""
+        about x and y of the world. ranges: offset, scale and unit."""
         value = np.array([plane_value(state.values[key]) for key in keys])
         across = np.array(
             [
@@ -249,4 +261,4 @@ class Planes(NamedTuple):
             ]
         )
         is_target = np.array([state.values[key].ndim == 2 for key in keys])
-        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, is_target, range_offset)
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, is_target, *ranges)

@@ -63,11 +63,11 @@ def assess(
     against: values of the rig file that the data contradict so strongly that other faults of the estimate may follow
     from them."""
     estimate, rig = determined.estimate, inputs.rig
-    effects = effects_left_out(inputs, estimate)  # first, as it needs much memory for a moment
+    left_out = effects_left_out(inputs, estimate)  # first, as it needs much memory for a moment
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
     contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
     changes = [change for _, change in contradicting]
-    determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, *changes]))
+    determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, left_out.shifts, *changes]))
     observability = _observed(inputs, determined, _column_names(inputs))
     groups = _groups(inputs, determined, observability, VarianceParts.of(determined, segments))
     validation = cross_validation(segments, [s for s in (rig.reference,) if _is_assumed(inputs, s)])
@@ -75,7 +75,7 @@ def assess(
     factors = _factors(inputs, groups)
     sensor_fits = _sensor_fits(inputs, estimate)
     assessed = AssessedEstimate(
-        inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline, effects
+        inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline, left_out.tested
     )
     causes, size_notes = all_causes(assessed, against)
     grave = tuple(c.sentence for c in causes if c.grave)

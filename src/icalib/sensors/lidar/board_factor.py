@@ -1,6 +1,7 @@
 """The factors of points of one LiDAR on the sheets of the target that cameras see, and of rings on these sheets.
 
-    y = R_scene_body^T (R_scene_lidar x (1 - range_offset / |x|) + p_scene_lidar - p_scene_body)
+    y = R_scene_body^T (R_scene_lidar x' + p_scene_lidar - p_scene_body)
+    x' = x (1 - range_offset / |x|) / (1 + range_scale)
 
 The print of each body is in its plane z = 0, whose pose the corners in the images give: no plane is estimated. The
 residual of a point is its distance from the sheet along its beam u, y_z / u_z, as range noise is along the beam.
@@ -43,8 +44,8 @@ from icalib.optim.rows import Rows
 from icalib.optim.state import Key, Layout, State, in_recording
 from icalib.rig.scene import SHEET_MIDDLE, TILT
 from icalib.sensors.lidar.binning import LidarNoise, each_in_world
-from icalib.sensors.lidar.residual import less_offset
-from icalib.sensors.lidar.spec import RANGE_OFFSET
+from icalib.sensors.lidar.residual import range_errors, true_ranges
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 
 # Points nearer to the rim of the sheet are not used: their beams (some 3 mrad wide, 1 cm at 3 m) miss it in part.
 RIM_M = 0.02
@@ -180,7 +181,7 @@ def _see_in_motion(stream: LidarStream, at: Pass, see: Callable[[_Cloud], None])
             R = state.values[in_recording(BOARD, int(recording[scan]) - 1), TILT.name]
             see(_Cloud(scan, _measured(scans, scan), (points[of_scan] @ R, origins[of_scan] @ R)))
 
-    each_in_world(at.motion, less_offset(scans, state), see_group)
+    each_in_world(at.motion, true_ranges(scans, state), see_group)
 
 
 def _measured(stream: LidarStream, scan: int) -> np.ndarray:
@@ -196,9 +197,9 @@ def elevations(xyz: np.ndarray) -> np.ndarray:
 
 def in_scene(xyz: np.ndarray, lidar: str, keyframe: np.ndarray, state: State) -> np.ndarray:
     """(n, 3) points xyz (n, 3) m of a LiDAR, each at its `keyframe` (n,), in the frame of the scene."""
-    v = state.values
-    offset = v[lidar, RANGE_OFFSET.name][0] / np.linalg.norm(xyz, axis=1, keepdims=True)
-    on_body = (1.0 - offset) * xyz @ v[lidar, "rotation"].T + v[lidar, "translation"]
+    v, (offset, scale) = state.values, range_errors(state, lidar)
+    ratio = (1.0 - offset / np.linalg.norm(xyz, axis=1, keepdims=True)) / (1.0 + scale)
+    on_body = ratio * xyz @ v[lidar, "rotation"].T + v[lidar, "translation"]
     return np.einsum("nij,nj->ni", state.rotation[keyframe], on_body) + state.position[keyframe]
 
 
@@ -473,9 +474,10 @@ class BoardFactor(RowFactor):
         return self.sigma[:, None]
 
     def _columns(self, recording: int) -> np.ndarray:
-        """Calibration columns of the LiDAR's pose, its range offset, tilt of the target and middle of its sheet, and
-        the poses of all bodies."""
-        keys = (self.name, RANGE_OFFSET.name), self._tilt(recording), self._middle
+        """Calibration columns of the LiDAR's pose, offset and scale of its ranges, tilt of the target and middle of its
+        sheet, and the poses of all bodies."""
+        ranges = ((self.name, spec.name) for spec in (RANGE_OFFSET, RANGE_SCALE))
+        keys = *ranges, self._tilt(recording), self._middle
         each = [self.layout.columns(*k) if self.layout.has(*k) else np.full(2, -1) for k in keys]
         poses, _ = self.bodies.columns(self.layout)
         return np.concatenate([Kinematics.of(self).columns(recording), *each, poses.ravel()])
@@ -516,23 +518,25 @@ class BoardFactor(RowFactor):
         p, on_boards = self.points, self.kind == ON_BOARDS
         at = SensorPose.at(Kinematics.of(self), p.seconds[block], p.keyframe[block], state, jacobians)
         m, normal = self._meetings(block, state, at), p.normal[block]
-        residual = m.along if on_boards else (normal * m.y).sum(axis=1) - p.reach[block]
+        residual = m.along / m.per_unit if on_boards else (normal * m.y).sum(axis=1) - p.reach[block]
         residual = residual - normal[:, :2] @ state.values[self._middle]  # along a sheet, not off it
         if not jacobians:
             return Rows(residual[:, None], np.zeros((0, 1, 0))), m.cosine
         # The derivative is that of the distance of this point from the plane through the beam and the edge; for points
-        # on the sheet, from the sheet, over the cosine.
-        z = np.array([0.0, 0.0, 1.0]) / m.cosine[:, None]
-        of_body = z if on_boards else normal - (normal * m.ray).sum(axis=1, keepdims=True) * z
+        # on the sheet, from the sheet, over the cosine, as the LiDAR measures lengths: its noise has no other scale.
+        z = np.array([0.0, 0.0, 1.0]) / (m.cosine * m.per_unit)[:, None]
+        of_body = z if on_boards else normal - (normal * m.ray).sum(axis=1, keepdims=True) * m.per_unit * z
         in_lidar, in_world = (np.einsum("nij,nj->ni", R, of_body) for R in (m.R_lidar_body, m.R_world_body))
-        J_further = np.zeros((len(residual), 1, 5 + self.bodies.columns(self.layout)[0].size))
-        J_further[:, 0, 0] = -(in_lidar * m.beam).sum(axis=1)
-        J_further[:, 0, 1:3] = np.cross(in_world, m.in_world)[:, :2]
-        J_further[:, 0, 3:5] = -normal[:, :2]
+        J_further = np.zeros((len(residual), 1, N_FURTHER + self.bodies.columns(self.layout)[0].size))
+        J_further[:, 0, 0] = -(in_lidar * m.beam).sum(axis=1) * m.per_unit
+        J_further[:, 0, 1] = J_further[:, 0, 0] * m.distance + (m.along if on_boards else 0.0)
+        J_further[:, 0, 2:4] = np.cross(in_world, m.in_world)[:, :2]
+        J_further[:, 0, 4:6] = -normal[:, :2]
         if self.bodies.several:
             in_scene = np.einsum("nij,nj->ni", self.bodies.poses(state.values)[0][p.body[block]], of_body)
             J_body = np.concatenate([np.cross(of_body, m.y), -in_scene], axis=1)
-            J_further[np.arange(len(J_body))[:, None], 0, 5 + 6 * p.body[block][:, None] + np.arange(6)] = J_body
+            own = N_FURTHER + 6 * p.body[block][:, None] + np.arange(6)
+            J_further[np.arange(len(J_body))[:, None], 0, own] = J_body
         J_pose = np.concatenate([np.cross(m.x, in_lidar), in_lidar], axis=1)[:, None, :]
         return rows_at(residual[:, None], (J_pose,), (at,), J_further), m.cosine
 
@@ -545,20 +549,26 @@ class BoardFactor(RowFactor):
         R_world_body = R_world_scene @ R[body]
         to_body, turned = partial(np.einsum, "nij,ni->nj", R_world_body), partial(np.einsum, "nij,nj->ni")
         body_in_world = turned(R_world_scene, origin[body])
-        beam = x / np.linalg.norm(x, axis=1, keepdims=True)
-        x = x - state.values[self.name, RANGE_OFFSET.name][0] * beam
+        beam, (offset, scale) = x / np.linalg.norm(x, axis=1, keepdims=True), range_errors(state, self.name)
+        x = (x - offset * beam) / (1.0 + scale)
+        distance = np.linalg.norm(x, axis=1)
         world, ray = turned(at.rotation, x) + at.position, to_body(turned(at.rotation, beam))
         along = to_body(world - body_in_world)[:, 2] / ray[:, 2]
         x, world = x - along[:, None] * beam, world - along[:, None] * turned(at.rotation, beam)
         R_lidar_body = np.einsum("nji,njk->nik", at.rotation, R_world_body)
         y = to_body(world - body_in_world)
-        return _Meetings(beam, x, world, y, ray, along, ray[:, 2], R_lidar_body, R_world_body)
+        return _Meetings(
+            beam, x, world, y, ray, along, ray[:, 2], R_lidar_body, R_world_body, distance, 1.0 / (1.0 + scale)
+        )
+
+
+N_FURTHER = 6  # columns of a row after those of the pose: offset and scale of ranges, tilt, middle of the sheet
 
 
 class _Meetings(NamedTuple):
     """Where n beams meet sheets: x, in_world, y (n, 3) m in the frames of the LiDAR, the world and the body; beam, ray
     (n, 3) unit vectors in those of the LiDAR and the body; along (n,) m: of the points behind it; cosine (n,): of beams
-    with the normals."""
+    with the normals; distance (n,) m: true range of the points; per_unit: their derivative by the measured one."""
 
     beam: np.ndarray
     x: np.ndarray
@@ -569,3 +579,5 @@ class _Meetings(NamedTuple):
     cosine: np.ndarray
     R_lidar_body: np.ndarray
     R_world_body: np.ndarray
+    distance: np.ndarray
+    per_unit: float

@@ -35,9 +35,9 @@ POSE_DIM, PLANE_DIM = 6, 3  # parameters of a pose and of a plane
 class NoiseSums(NamedTuple):
     """Products of Jacobians by the unknown rotation x, summed over the bins on one side of a keyframe.
 
-    information (3, 3): products of x with itself. by_pose (3, w + 1): products of x with the w columns of keyframes and
-    calibration parameters that act through the pose, and with the residual. by_plane (P, 3, 3): products of x with the
-    columns of each plane; only those of the first n_planes (1,) numbers in `planes` (P,) are
+    information (3, 3): products of x with itself. by_pose (3, w + 2): products of x with the w columns of keyframes and
+    calibration parameters that act through the pose, with the scale of ranges, and with the residual. by_plane (P, 3,
+    3): products of x with the columns of each plane; only those of the first n_planes (1,) numbers in `planes` (P,) are
     filled.
     """
 
@@ -53,7 +53,7 @@ def empty_noise_sums(width, n_planes):
     """`NoiseSums` of zero. width: number of columns that act through the pose; n_planes: of planes."""
     by_plane = np.zeros((n_planes, 3, PLANE_DIM))
     return NoiseSums(
-        np.zeros((3, 3)), np.zeros((3, width + 1)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
+        np.zeros((3, 3)), np.zeros((3, width + 2)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
     )
 
 
@@ -89,27 +89,31 @@ def add_pose_noise(gram, J_pose, noise):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_plane_noise(J_rows_noise, J_rows, q, noise):
-    """Adds the products of x with plane q in one bin. J_rows (10, 4): derivatives by the pose, then by the plane."""
+    """Adds the products of x with plane q and the scale of ranges in one bin. J_rows (11, 4): derivatives by the pose,
+    the plane, and the scale."""
     known = False
     for i in range(noise.n_planes[0]):
         known = known or noise.planes[i] == q
     if not known:
         noise.planes[noise.n_planes[0]] = q
         noise.n_planes[0] += 1
+    scale = noise.by_pose.shape[1] - 2
     for a in range(3):
-        for t in range(PLANE_DIM):
-            for c in range(4):
+        for c in range(4):
+            noise.by_pose[a, scale] += J_rows_noise[a, c] * J_rows[SCALE, c]
+            for t in range(PLANE_DIM):
                 noise.by_plane[q, a, t] += J_rows_noise[a, c] * J_rows[POSE_DIM + t, c]
 
 
 @njit(cache=True, nogil=True, inline="always")
 def noise_columns(noise, columns, plane_columns):
-    """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then those of the planes seen,
-    from plane_columns (P, 3)."""
-    n_c, n = len(columns), noise.n_planes[0]
+    """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then that of the scale of
+    ranges and those of the planes seen, from plane_columns (P, 4)."""
+    n_c, n = len(columns) + 1, noise.n_planes[0]
     out = np.empty(n_c + PLANE_DIM * n, np.int64)
-    for j in range(n_c):  # in loops: copies of arrays take seconds to compile
+    for j in range(len(columns)):  # in loops: copies of arrays take seconds to compile
         out[j] = columns[j]
+    out[n_c - 1] = plane_columns[0, PLANE_DIM]
     for i in range(n):
         for t in range(PLANE_DIM):
             out[n_c + PLANE_DIM * i + t] = plane_columns[noise.planes[i], t]
@@ -118,7 +122,7 @@ def noise_columns(noise, columns, plane_columns):
 
 @njit(cache=True, nogil=True, inline="always")
 def eliminated_noise(noise):
-    """V (3, w + 3 n + 1) such that V^T V is the Schur complement term of x, which the normal equations lose.
+    """V (3, w + 3 n + 2) such that V^T V is the Schur complement term of x, which the normal equations lose.
 
     Columns: keyframes, calibration parameters in the order of `noise_columns` (n planes seen), residual. Resets the
     sums.
@@ -148,7 +152,8 @@ def eliminated_noise(noise):
 
 
 N_WHITENED = 4  # residuals of an entry
-DISTANCE = POSE_DIM + PLANE_DIM  # row of the residual itself in the arrays of an entry, after its derivatives
+SCALE = POSE_DIM + PLANE_DIM  # row of the scale of ranges in the arrays of an entry, after pose and plane
+DISTANCE = SCALE + 1  # row of the residual itself, after its derivatives
 
 
 class Bins(NamedTuple):
@@ -196,10 +201,22 @@ def _shorten(row, root, offset, derivative):
         row[c] += offset * derivative[c]
 
 
+@njit(cache=True, nogil=True, inline="always")
+def _correct_ranges(row, root, q, planes, derivative):
+    """Makes coefficients `row` (4,) of (1, x) those of points with the errors of ranges in `planes`, in lengths as the
+    LiDAR measures them: in true lengths, a larger scale would make the noise smaller. For the target, fills derivative
+    (4,), theirs by the offset."""
+    row[0] *= 1.0 + planes.range_scale
+    if planes.is_target[q]:
+        _shorten(row, root, planes.range_offset, derivative)
+        for c in range(N_WHITENED):
+            derivative[c] *= planes.range_unit
+
+
 @njit(cache=True, nogil=True)
 def _fill_jacobian(R_lw, p_wl, q, planes, m, root, J_distance):
-    """Fills J_distance (10, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows) and plane (3
-    rows), then in the distance. root (10,): of the moments of the points.
+    """Fills J_distance (11, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows), plane (3
+    rows) and scale of ranges, then in the distance. root (10,): of the moments of the points.
 
     With a = R^T n the derivatives by the pose are (x cross a; a), because a rotation t of the LiDAR moves x by
     t cross x, and a . (t cross x) = t . (x cross a).
@@ -219,10 +236,11 @@ def _fill_jacobian(R_lw, p_wl, q, planes, m, root, J_distance):
     A[POSE_DIM + 2, 0] = -1.0
     for c in range(N_WHITENED):
         A[DISTANCE, c] = m[c]
-    if planes.is_target[q]:
-        for i in range(POSE_DIM + 2):
-            _shorten(A[i], root, planes.range_offset, A[POSE_DIM + 2])
-        _shorten(A[DISTANCE], root, planes.range_offset, A[POSE_DIM + 2])
+    A[POSE_DIM + 2, 0] *= 1.0 + planes.range_scale
+    for i in range(POSE_DIM + 2):
+        _correct_ranges(A[i], root, q, planes, A[POSE_DIM + 2])
+    _correct_ranges(A[DISTANCE], root, q, planes, A[POSE_DIM + 2])
+    A[SCALE, 0] = planes.range_unit * m[0]
 
 
 @njit(cache=True, nogil=True)
@@ -255,47 +273,48 @@ def _add_pose_gram(J_rows, J_distance, incidence, gram):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
-    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (3,) of its plane, of
+    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (4,) of its plane, of
     which some may be fixed.
 
-    J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (3, w): workspace.
+    J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (4, w): workspace.
     """
     B, n_b, n_chain = J_rows, sums.calib.shape[0] - 1, J_pose.shape[1] - len(columns)
     V[:] = 0.0
+    n = PLANE_DIM + 1 if plane_columns[PLANE_DIM] >= 0 else PLANE_DIM
     for i in range(POSE_DIM):
-        for t in range(PLANE_DIM):
+        for t in range(n):
             b = B[POSE_DIM + t]
             v = B[i, 0] * b[0] + B[i, 1] * b[1] + B[i, 2] * b[2] + B[i, 3] * b[3]
             for j in range(J_pose.shape[1]):
                 V[t, j] += v * J_pose[i, j]
     for h in range(n_chain // KEYFRAME_DIM):
         for r in range(KEYFRAME_DIM):
-            for t in range(PLANE_DIM):
+            for t in range(n):
                 if plane_columns[t] >= 0:
                     sums.side[k + h, r, plane_columns[t]] += V[t, KEYFRAME_DIM * h + r]
     for j in range(len(columns)):
         if columns[j] >= 0:
-            for t in range(PLANE_DIM):
+            for t in range(n):
                 if plane_columns[t] >= 0:
                     sums.calib[columns[j], plane_columns[t]] += V[t, n_chain + j]
                     sums.calib[plane_columns[t], columns[j]] += V[t, n_chain + j]
-    for t in range(PLANE_DIM):
+    for t in range(n):
         b = B[POSE_DIM + t]
-        for c in range(PLANE_DIM + 1):
-            d, other = B[POSE_DIM + c], n_b if c == PLANE_DIM else plane_columns[c]
+        for c in range(n + 1):
+            d, other = B[POSE_DIM + c if c < n else DISTANCE], n_b if c == n else plane_columns[c]
             if plane_columns[t] < 0 or other < 0:
                 continue
             s = b[0] * d[0] + b[1] * d[1] + b[2] * d[2] + b[3] * d[3]
             sums.calib[plane_columns[t], other] += s
-            if c == PLANE_DIM:
+            if c == n:
                 sums.calib[n_b, plane_columns[t]] += s
 
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane_incidence(J_distance, incidence, plane_columns, sums):
-    """Adds the gradient of the incidence term by the plane with columns `plane_columns` (3,) to the sums."""
+    """Adds the gradient of the incidence term by the plane with columns `plane_columns` (4,) to the sums."""
     n_b = sums.calib.shape[0] - 1
-    for t in range(PLANE_DIM):
+    for t in range(PLANE_DIM + 1):
         J = J_distance[POSE_DIM + t]
         s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
         if plane_columns[t] >= 0:
@@ -324,7 +343,7 @@ def _is_last_of_side(i, bins):
 class _BinWork(NamedTuple):
     """Workspace. J_pose (6, w), J_imu_pose (6, 6): see `fill_chain`; m (4,): see `_fill_distance`.
 
-    J_distance, J_rows (10, 4): derivatives of an entry, and these times its root. gram (6, 7): products of the
+    J_distance, J_rows (11, 4): derivatives of an entry, and these times its root. gram (6, 7): products of the
     derivatives of a bin by its pose with themselves and with the residual. gram_noise (3, 6): their products with the
     derivatives by the unknown rotation. F, V: see `add_gram` and `_add_plane`.
     """
@@ -354,7 +373,7 @@ def _work_space(at, n_columns):
         np.empty((POSE_DIM, POSE_DIM + 1)),
         np.empty((3, POSE_DIM)),
         np.empty((POSE_DIM, width + 1)),
-        np.empty((PLANE_DIM, width)),
+        np.empty((PLANE_DIM + 1, width)),
     )
 
 
@@ -366,8 +385,7 @@ def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
     _fill_distance(R_lw, p_wl, bins.plane[e], planes, m)
     for c in range(N_WHITENED):
         work.J_distance[0, c] = m[c]
-    if planes.is_target[bins.plane[e]]:
-        _shorten(work.J_distance[0], bins.root[e], planes.range_offset, work.J_distance[1])
+    _correct_ranges(work.J_distance[0], bins.root[e], bins.plane[e], planes, work.J_distance[1])
     _times_root(work.J_distance, bins.root[e], rows[e : e + 1])
     cost = incidence[e, 0]
     for c in range(N_WHITENED):
@@ -412,7 +430,7 @@ def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise,
         _add_pose_gram(B, A, bins.incidence[e], work.gram)
     if has_noise:
         add_entry_noise(bins.J_rows_noise[e], bins.J_incidence_noise[e], rows[e], B, work.gram_noise, noise)
-    if wanted and max(plane_columns[0], plane_columns[2]) >= 0:
+    if wanted and max(plane_columns[0], plane_columns[2], plane_columns[3]) >= 0:
         _add_plane(k, B, work.J_pose, columns, plane_columns, sums, work.V)
         _add_plane_incidence(A, bins.incidence[e], plane_columns, sums)
         if has_noise:

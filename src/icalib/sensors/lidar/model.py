@@ -18,7 +18,7 @@ from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points
 from icalib.sensors.lidar.board_factor import ON_EDGES, BoardFactor
 from icalib.sensors.lidar.patch_factor import PatchFactor
 from icalib.sensors.lidar.residual import LidarFactor
-from icalib.sensors.lidar.spec import RANGE_OFFSET
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 
 # Isotropic noise in addition to stated range noise; without it beams parallel to a plane would have infinite weight.
 GRAZING_SIGMA_M = 1e-3
@@ -31,11 +31,13 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     isotropic."""
 
     def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
-        """See `SensorModel`. Only sheets whose distance is known from images show a range offset."""
-        observable = spec is not RANGE_OFFSET or (association.at_rest and rig.has_target)
-        if association.sheets:
+        """See `SensorModel`. Only sheets whose distance is known from images show a range offset; surfaces that LiDARs
+        at rest share show no scale either."""
+        on_boards = association.at_rest and rig.has_target
+        observable = spec is not RANGE_SCALE or on_boards or not association.at_rest
+        if spec is RANGE_OFFSET:
             k = [x.name for x in rig.lidars].index(sensor.name)
-            observable = observable or association.points_on_sheets[k].any()
+            observable = on_boards or bool(association.sheets and association.points_on_sheets[k].any())
         return observable and super().is_estimated(sensor, spec, rig, association)
 
     def keyframe_times(

@@ -2,6 +2,9 @@
 
     residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    for each point x at its instant t
 
+Here x is the measured point less range_offset along its beam, over 1 + range_scale. With a scale, the residual is that
+times 1 + range_scale, whose noise does not depend on the scale.
+
 This is the signed form of (24) and (25). A factor stores moments of the points (`take_moments`), computed once per
 pass: robust weights and the association with planes stay constant while the solver runs. Its rows are the four whitened
 residuals of each plane in a bin, which are equivalent to the residuals of all points there (`kernels`).
@@ -29,22 +32,25 @@ from icalib.rig.scene import TILT
 from icalib.sensors.lidar import kernels
 from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
-from icalib.sensors.lidar.spec import RANGE_OFFSET
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 
 BINS_PER_CHUNK = 512  # poses and Jacobians of so many bins fit the processor cache
 
 
-def range_offset(state: State, lidar: str) -> float:
-    """How much too far the LiDAR measures [m]; 0 in a state without this parameter, as that of its odometry."""
-    return float(state.values.get((lidar, RANGE_OFFSET.name), [0.0])[0])
+def range_errors(state: State, lidar: str) -> tuple[float, float]:
+    """What the LiDAR measures too much [m], and measured over true range, less 1; 0 in a state without these
+    parameters, as that of its odometry."""
+    offset, scale = (float(state.values.get((lidar, x.name), [0.0])[0]) for x in (RANGE_OFFSET, RANGE_SCALE))
+    return offset, scale
 
 
-def less_offset(stream: LidarStream, state: State) -> LidarStream:
+def true_ranges(stream: LidarStream, state: State) -> LidarStream:
     """The stream with corrected ranges."""
-    offset = np.float32(range_offset(state, stream.name))
-    if offset == 0.0:
+    offset, scale = (np.float32(x) for x in range_errors(state, stream.name))
+    if offset == scale == 0.0:
         return stream
-    return replace(stream, xyz=stream.xyz * (1.0 - offset / np.linalg.norm(stream.xyz, axis=1, keepdims=True)))
+    distance = np.linalg.norm(stream.xyz, axis=1, keepdims=True)
+    return replace(stream, xyz=stream.xyz * ((1.0 - offset / distance) / (1.0 + scale)))
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,8 @@ class LidarFactor(RowFactor):
     keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
     J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
     in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Ranges
-    are less range_offset [m]; its changes within a pass act on the sheet alone, which shows it.
+    have been corrected by the range_errors of the state from which the pass starts; changes of the offset within it act
+    on the sheet alone, which shows it.
     """
 
     name: str
@@ -64,7 +71,7 @@ class LidarFactor(RowFactor):
     J_rows_noise: np.ndarray
     J_incidence_noise: np.ndarray
     planes: tuple[Key, ...]
-    range_offset: float
+    range_errors: tuple[float, float]
     imu: ImuData
     gravity: float
     scheme: Scheme
@@ -86,8 +93,7 @@ class LidarFactor(RowFactor):
         """The factor of a pass that starts from `motion`. plane (N,) int32: index of each point into `planes`, -1:
         none. Raises EstimationError if no point is left."""
         values = np.array([plane_value(motion.state.values[p]) for p in planes])
-        offset = range_offset(motion.state, stream.name)
-        cloud = AssociatedPoints(less_offset(stream, motion.state), plane, values)
+        cloud = AssociatedPoints(true_ranges(stream, motion.state), plane, values)
         moments = take_moments(cloud, motion, noise, bin_s)
         times = instants(stream, motion.state.values, moments.seconds)
         keyframe = assign_keyframes(scheme, motion.state.seconds, times, motion.imu.forwards)
@@ -98,8 +104,8 @@ class LidarFactor(RowFactor):
         J_incidence = np.zeros((len(moments.plane), 3), np.float32)
         n = len(motion.state.seconds)
         factor = cls(
-            stream.name, moments, keyframe, noise_angle, J_rows, J_incidence, planes, offset, motion.imu,
-            motion.gravity, scheme, layout, n,
+            stream.name, moments, keyframe, noise_angle, J_rows, J_incidence, planes,
+            range_errors(motion.state, stream.name), motion.imu, motion.gravity, scheme, layout, n,
         )  # fmt: skip
         factor._linearise_noise(motion.state)
         return factor
@@ -116,10 +122,12 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _plane_columns(self) -> np.ndarray:
-        """(P, 3) calibration columns of each plane, see `Planes`."""
+        """(P, 4) calibration columns of each plane, see `Planes`."""
         last = {TILT.name: ((self.name, RANGE_OFFSET.name),)}
+        scale = self.layout.columns(self.name, RANGE_SCALE.name)
+        of_planes = ((p, *last.get(p[1], ())) for p in self.planes)
         return np.array(
-            [np.concatenate([self.layout.block(*key).columns for key in (p, *last.get(p[1], ()))]) for p in self.planes]
+            [np.concatenate([*(self.layout.block(*key).columns for key in keys), scale]) for keys in of_planes]
         )
 
     @property
@@ -157,8 +165,10 @@ class LidarFactor(RowFactor):
 
     def _chunks(self, state: State, b0: int, b1: int) -> Iterator[tuple[Bins, SensorPose, np.ndarray, Planes]]:
         """Yields bins b0:b1 in chunks, with poses of the LiDAR, their calibration columns (c,), and the planes."""
-        offset, m = range_offset(state, self.name) - self.range_offset, self.moments
-        planes = Planes.of(self.planes, state, self._plane_columns, offset)
+        (offset, scale), (offset0, scale0), m = range_errors(state, self.name), self.range_errors, self.moments
+        per_unit = 1.0 / (1.0 + scale0)
+        left = per_unit * (offset - offset0), per_unit * (scale - scale0), per_unit
+        planes = Planes.of(self.planes, state, self._plane_columns, left)
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
         for columns, a, b in self._chunk_ends(state, kinematics, b0, b1):
             keyframe, noise = self.keyframe[a:b], (self.J_rows_noise, self.J_incidence_noise)

@@ -14,7 +14,8 @@ from icalib.base.compiled import njit
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
-from icalib.sensors.lidar.spec import Lidar
+from icalib.sensors.lidar.spec import RANGE_SCALE, Lidar
+from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, RoomSurfaces, nearest
 from icalib.tools.simulation.scenario import (
@@ -24,6 +25,7 @@ from icalib.tools.simulation.scenario import (
     SimRecord,
     SimScene,
     SimSensor,
+    TrueParameters,
     at_least,
     interval,
     mounted_fields,
@@ -32,6 +34,7 @@ from icalib.tools.simulation.trajectory import LEAD_S, Drive, TrueTrajectory, st
 
 _FIRING_S = 2.304e-6  # between the firings of two lasers of a column (Velodyne VLP-16 manual)
 _CLOUD_MESSAGE = "sensor_msgs/msg/PointCloud2"
+EXACT = Parameter("fixed", np.zeros(1))  # ranges, for the rig file
 _FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
 
@@ -41,12 +44,13 @@ class SimLidar(SimSensor):
 
     A scan is one turn of azimuth_steps columns with `rings` points, at elevations evenly over elevation_deg. The lasers
     of a column fire 2.304 us apart, or faster if a column is shorter. The stamp of a scan is the instant of its first
-    column. Points outside range_m are missing. Noise is along the beam.
+    column. Points outside range_m are missing. Noise is along the beam. scale: ratio of true to reported ranges.
     """
 
     sensor_type: ClassVar[str] = "lidar"
     random_stream: ClassVar[int] = 1000
     measures: ClassVar[str] = "scans"
+    effects: ClassVar[dict[str, str]] = {"range_scale": "scale"}
 
     rate_hz: float = 8.0
     rings: int = 16
@@ -54,6 +58,7 @@ class SimLidar(SimSensor):
     elevation_deg: tuple[float, float] = (-15.0, 15.0)
     range_m: tuple[float, float] = (0.3, 100.0)
     range_noise_m: float = 0.03
+    scale: float = 1.0
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimLidar:
@@ -71,6 +76,9 @@ class SimLidar(SimSensor):
     def check(self, room: Room | None, drive: Drive | None) -> None:
         if room is None:
             raise RigError(f"{self.name} needs a room; give the scenario one.")
+
+    def true_parameters(self) -> TrueParameters:
+        return TrueParameters({RANGE_SCALE.name: np.array([1.0 / self.scale - 1.0])} if self.scale != 1.0 else {})
 
     @property
     def points(self) -> int:
@@ -101,7 +109,8 @@ class SimLidar(SimSensor):
 
     def rig_entry(self) -> Lidar:
         near, far = self.range_m
-        return Lidar(self.name, f"{self.name}/scans.npz", self.range_noise_m, min_range_m=near, max_range_m=far)
+        ranges = {"min_range_m": near, "max_range_m": far, "range_scale": EXACT}
+        return Lidar(self.name, f"{self.name}/scans.npz", self.range_noise_m, **ranges)
 
     def record(self, stream: LidarStream, offset_ns: int) -> SimRecord:
         """Arrays, and PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""
@@ -149,6 +158,7 @@ class _Turn(NamedTuple):
     firing: np.ndarray  # (K,) instants as a share of a column
     noise: np.ndarray  # (A, K) m
     range_m: tuple[float, float]
+    scale: float
 
 
 class _Points(NamedTuple):
@@ -172,6 +182,7 @@ def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.n
         firing,
         noise,
         lidar.range_m,
+        lidar.scale,
     )
 
 
@@ -203,7 +214,7 @@ def _fill_points(surfaces: RoomSurfaces, turn: _Turn, column_s: float, points: _
             distance, face = nearest(surfaces, p[0], p[1], p[2], d[0], d[1], d[2])
             if not (turn.range_m[0] <= distance <= turn.range_m[1]):
                 continue
-            measured = distance + turn.noise[a, k]
+            measured = distance / turn.scale + turn.noise[a, k]
             points.xyz[count, 0] = measured * x
             points.xyz[count, 1] = measured * y
             points.xyz[count, 2] = measured * z

@@ -31,6 +31,21 @@ RANGE_OFFSET = ParameterSpec(
     meaning="measured less true range, the same at all ranges",
     motion="show the board nearer and farther",
 )
+# Measured over true range, less 1. The prior is that accuracy over 30 m, to which many points are.
+RANGE_SCALE = ParameterSpec(
+    name="range_scale",
+    size=1,
+    manifold="nuisance",
+    unit="",
+    labels=("range_scale",),
+    tolerance=1e-3,
+    prior_sigma=1e-3,
+    is_auxiliary=True,
+    is_effect=True,
+    is_considered=True,
+    meaning="measured over true range, less 1",
+    motion="move farther, where other sensors show how far",
+)
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
@@ -50,7 +65,7 @@ class Lidar(MountedSensor):
     readings: ClassVar[str] = "scans"
     gives_motion: ClassVar[bool] = True
     shows_planes: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, RANGE_OFFSET)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, RANGE_OFFSET, RANGE_SCALE)
 
     path: str
     range_noise_m: float | None = None  # sigma along the beam; None: estimated from the residuals
@@ -61,6 +76,7 @@ class Lidar(MountedSensor):
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
     range_offset: Parameter = Parameter()
+    range_scale: Parameter = Parameter("fixed")
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Lidar:

@@ -12,7 +12,7 @@ import yaml
 from icalib.geometry.targets import NoTarget
 from icalib.rig import BY_CLASS, TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
 from icalib.rig.file import rig_to_dict
-from icalib.sensors.sensor import CLOCK_RATE, Sampling, mounted
+from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.motion import rotation_from_vector
 from icalib.tools.simulation.recording import raw_time_offset, true_values
 from icalib.tools.simulation.scenario import GRAVITY_WORLD, Scenario, SimCamera, SimSensor
@@ -115,7 +115,8 @@ def _treated(
 ) -> Sensor:
     """The sensor with each parameter group treated as in `rig_for`; true: values by name. The rate of the clock
     is left as it is unless it has a treatment of its own."""
-    groups = ({spec.name for spec in sensor.stated()} & true.keys()) - ({CLOCK_RATE.name} - treatments.keys())
+    usual = {spec.name for spec in sensor.stated() if not spec.is_effect} | treatments.keys()
+    groups = usual & true.keys()
     prefix = "imu_" if sensor.is_inertial else ""  # the intrinsics of an IMU are other parameters than those of cameras
     named: dict[str, Treatment] = {
         name: treatments.get(prefix * (name == "intrinsics") + name, others) for name in groups

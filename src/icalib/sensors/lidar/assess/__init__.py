@@ -18,7 +18,8 @@ from icalib.estimate.problem import motion_of
 from icalib.geometry.planes import plane_of
 from icalib.motion.factor import of_type
 from icalib.motion.poses import instants, usable
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause, Remedy
+from icalib.observability.prior_sensitivity import EFFECT_SIGMAS
 from icalib.optim.state import State, plane_value
 from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
@@ -27,7 +28,8 @@ from icalib.rig import Lidar, Rig
 from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes, wrong_sheets
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.patch_factor import PatchFactor
-from icalib.sensors.lidar.residual import LidarFactor, less_offset
+from icalib.sensors.lidar.residual import LidarFactor, true_ranges
+from icalib.sensors.lidar.spec import RANGE_SCALE
 from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
@@ -44,13 +46,46 @@ HALF_STEP_S = np.float32(2e-3)  # half the step of the central difference of res
 def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     if a.inputs.association.at_rest:
-        return on_boards(a) if a.inputs.rig.has_target else Assessment(notes=_notes_on_patches(a))
+        if a.inputs.rig.has_target:
+            return replace(on_boards(a), causes=scale_causes(a))
+        return Assessment(notes=_notes_on_patches(a))
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a)),
+        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), scale_notes(a)),
         warnings=chain(warnings(a.inputs, a.estimate), wrong_sheets(a)),
+        causes=scale_causes(a),
     )
+
+
+def scale_causes(a: AssessedEstimate) -> Iterator[Cause]:
+    """A cause for each LiDAR whose ranges have another scale than all other lengths. Beside a target it may be the
+    target whose size is wrong."""
+    for e in a.effects:
+        if e.spec is not RANGE_SCALE or not e.differs:
+            continue
+        scale, advice, remedy = float(e.value[0]), "", Remedy(e.amended)
+        if a.inputs.rig.has_target:
+            advice, remedy = "Measure the target and correct its size in the rig file. If it is right: w", None
+        words = f"{advice or 'W'}rite range_scale: {{prior: 0, sigma: {e.prior_sigma:.2g}}} for {e.sensor}."
+        sentence = f"ranges of {e.sensor} are {_percent(scale, float(e.std[0]))} than other sensors say. {words}"
+        yield Cause(Remark("ranges_contradict", sentence), e.gain, e.moves > 1.0, remedy=remedy)
+
+
+def _percent(scale: float, std: float) -> str:
+    """How much too long or short ranges are."""
+    return f"{100.0 * abs(scale):.2g} +- {100.0 * std:.2g} % {'longer' if scale > 0.0 else 'shorter'}"
+
+
+def scale_notes(a: AssessedEstimate) -> Iterator[Remark]:
+    """A note for each LiDAR whose ranges have a scale of their own in the result."""
+    for g in a.groups:
+        if g.name == RANGE_SCALE.name and g.columns is not None and abs(g.value[0]) > EFFECT_SIGMAS * g.std[0]:
+            yield Remark(
+                "range_scale_estimated",
+                f"ranges of {g.sensor} are {_percent(float(g.value[0]), float(g.std[0]))} than true ones, which the "
+                "estimate includes; divide them where you use them, too.",
+            )
 
 
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
@@ -107,7 +142,7 @@ def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.
     points = points[:: max(1, -(-len(points) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
     one = stream.numbered(points)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
-    return less_offset(one.numbered(np.flatnonzero(running)), state), plane[points[running]]
+    return true_ranges(one.numbered(np.flatnonzero(running)), state), plane[points[running]]
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:

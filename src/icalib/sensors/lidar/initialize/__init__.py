@@ -31,7 +31,7 @@ from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 from icalib.sensors.lidar.initialize.surroundings import are_stops, at_stops, guess_by_surroundings, stops
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error, leading
-from icalib.sensors.lidar.spec import RANGE_OFFSET
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 
 
 class LidarInitializer(Initializer[Lidar]):
@@ -82,9 +82,9 @@ class LidarInitializer(Initializer[Lidar]):
         """Inputs and state with points associated with planes, and known values. The rounds may change parameters that
         the motion does not determine, so the inputs keep the initial guess from before the rounds."""
         known = {key: value for lidar in inputs.rig.lidars for key, value in stated_values(inputs, lidar).items()}
-        offsets = {(x.name, RANGE_OFFSET.name): x.range_offset.value for x in inputs.rig.lidars}
-        offsets = {key: np.zeros(1) if value is None else value for key, value in offsets.items()}
-        state = replace(state, values=offsets | state.values)
+        stated = {(x.name, s.name): getattr(x, s.name) for x in inputs.rig.lidars for s in (RANGE_OFFSET, RANGE_SCALE)}
+        ranges = {key: np.zeros(1) if p.value is None else p.value for key, p in stated.items()}
+        state = replace(state, values=ranges | state.values)
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)
         return replace(inputs, guess=guess), state, known

@@ -57,7 +57,7 @@ from icalib.sensors.lidar.board_factor import ON_SHEET, TargetSheet
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
-from icalib.sensors.lidar.residual import less_offset
+from icalib.sensors.lidar.residual import true_ranges
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import MOUNTED_NAMES
 
@@ -393,7 +393,7 @@ def associate(
 ) -> AssociatedPlanes:
     """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
     shares most points. Points on the `sheet` are on no other plane. Raises EstimationError if there is no plane."""
-    streams = [less_offset(s, motion.state) for s in streams]
+    streams = [true_ranges(s, motion.state) for s in streams]
     step = odd_step(sum(len(s.xyz) for s in streams))
     thinned = [in_world(motion, _every(step, s)) for s in streams]
     away = [sheet and sheet.away(*cloud, search, MIN_PLANE_POINTS) for cloud in thinned]
