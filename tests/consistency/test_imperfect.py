@@ -92,13 +92,12 @@ def test_lengths_carry_the_uncertainty_of_ranges(program: ModuleType, exact: boo
 def test_a_scale_of_ranges_is_found(program: ModuleType):
     scenario = poses_and_lidar(program, 1.01)
     rig = program.rig_of(scenario, program.Kind(lambda: scenario, True, ()))
-    result = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated())
+    simulation = simulate(scenario, 1)
+    result = calibrate_measurements(rig, simulation.measurements.unassociated())
     scale = result.group("lidar0", "range_scale")
     assert abs(scale.value[0] - (1.0 / 1.01 - 1.0)) < 3.0 * scale.std[0] < 4e-3
     assert "range_scale_estimated" in [note.name for note in result.notes]
-    assert (
-        max(off for _, verdict, off in program.errors(result, simulate(scenario, 1)) if verdict == "determined") < 4.0
-    )
+    assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
 
 
 @pytest.mark.full
