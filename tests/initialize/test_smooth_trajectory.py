@@ -52,3 +52,14 @@ def test_noise_is_smoothed_and_gaps_are_known(step):
     assert not path.near[inside].any() and path.near[far].all()
     off = (path.position - moving(at)[1])[path.near]
     assert np.sqrt(np.mean(off**2)) < 1e-3
+
+
+def test_the_variance_of_the_acceleration_is_its_scatter():
+    rng, t, at = np.random.default_rng(2), np.arange(0.0, 2.0, 0.05), np.array([0.4, 1.0, 1.33])
+    sigma = np.where(np.abs(t - 1.2) < 0.2, 0.02, 1e-3)
+    R, p = moving(t)
+    noisy = (p + sigma[:, None] * rng.standard_normal(p.shape) for _ in range(400))
+    paths = [smooth_trajectory(t, R, x, at, True, sigma**2) for x in noisy]
+    scatter = np.std([path.acceleration for path in paths], axis=0)
+    np.testing.assert_allclose(np.sqrt((scatter**2).mean(axis=1)), np.sqrt(paths[0].acceleration_variance), rtol=0.1)
+    assert not smooth_trajectory(t, R, p, at).acceleration_variance.any()

@@ -51,6 +51,7 @@ SLOW_HZ = 10.0  # rate of poses below which motion by hand may change direction 
 ASSUMED_IMU_STEP_S = 0.01  # s between its readings
 DENSITY_LAG_S = 0.1  # s: lag over which changes of rate and acceleration are compared to estimate their densities
 MIN_DENSITY = 1e-3  # rad/s^2/sqrt(Hz), m/s^3/sqrt(Hz): floor for a body at rest
+REWEIGHTINGS = 10  # of these changes by their noise; twice as many change the density by less than 1 %
 MIN_KEYFRAME_SPACING_S = 0.02  # s between keyframes, as with an IMU
 
 
@@ -229,17 +230,13 @@ def _keyframe_motion(
 def _with_assumption(rig: Rig, recordings: Sequence[Measurements], paths: Sequence[SmoothTrajectory]) -> Rig:
     """The rig with the assumed IMU, which coincides with the body. Its noise densities are those of the motion, times
     the `prior_factor` of the body."""
-    turning, jerking = (
-        np.sqrt(np.mean(np.concatenate([_changes_over_lag(p, field) for p in paths]) ** 2) / DENSITY_LAG_S)
-        + MIN_DENSITY
-        for field in ("rate", "acceleration")
-    )
+    turning, jerking = motion_densities(paths)
     identity = mounted(fixed(np.eye(3)), fixed(np.zeros(3)), fixed(np.zeros(1)))
     factor = initializer_of(rig.sensors[rig.reference]).prior_factor
     imu = assumed_imu(factor * turning, factor * jerking)
     settings = rig.settings
     if rig.lidars or not motion_kinds(rig)[0].hosts_keyframes:
-        spacing = keyframe_spacing(rig, recordings, SmoothMotion(paths, float(turning), float(jerking)))
+        spacing = keyframe_spacing(rig, recordings, SmoothMotion(paths, turning, jerking))
         imu = replace(imu, pose_keyframes_s=spacing)
         if rig.lidars:  # they measure between the measurements of others, too
             settings = replace(settings, keyframe_spacing_s=spacing)
@@ -254,11 +251,27 @@ def keyframe_spacing(rig: Rig, recordings: Sequence[Measurements], motion: Smoot
     return float(np.clip(longest, MIN_KEYFRAME_SPACING_S, max(rig.settings.keyframe_spacing_s, MIN_KEYFRAME_SPACING_S)))
 
 
-def _changes_over_lag(path: SmoothTrajectory, field: str) -> np.ndarray:
-    """Changes (n, 3) of the attribute `field` over DENSITY_LAG_S, between instants with poses nearby."""
+def motion_densities(paths: Sequence[SmoothTrajectory]) -> tuple[float, float]:
+    """Densities of the motion's angular acceleration [rad/s^2/sqrt(Hz)] and jerk [m/s^3/sqrt(Hz)]: RMS changes of rate
+    and acceleration over DENSITY_LAG_S, between instants with poses nearby, over the root of this time.
+
+    A squared change of acceleration is weighted by 1 / (noise + mean)^2, the inverse of its variance up to a factor
+    (iteratively reweighted least squares), so that poses of a target that is hardly seen do not count. Noise is not
+    subtracted: too small a density makes estimates overconfident, too large a one only less certain.
+    """
     n = round(DENSITY_LAG_S / ASSUMED_IMU_STEP_S)
-    x = getattr(path, field)
-    return (x[n:] - x[:-n])[path.near[n:] & path.near[:-n]]
+
+    def over_lag(combined: np.ufunc, field: str) -> np.ndarray:
+        columns = ((getattr(p, field), p.near[n:] & p.near[:-n]) for p in paths)
+        return np.concatenate([combined(x[n:], x[:-n])[near] for x, near in columns])
+
+    turns, squares = over_lag(np.subtract, "rate") ** 2, (over_lag(np.subtract, "acceleration") ** 2).mean(axis=1)
+    noise, jerks = over_lag(np.add, "acceleration_variance") + MIN_DENSITY**2 * DENSITY_LAG_S, np.mean(squares)
+    for _ in range(REWEIGHTINGS):
+        weight = (noise + jerks) ** -2
+        jerks = weight @ squares / weight.sum()
+    turning, jerking = (float(np.sqrt(x / DENSITY_LAG_S)) + MIN_DENSITY for x in (np.mean(turns), jerks))
+    return turning, jerking
 
 
 def _body_identities(inputs: Inputs) -> Values:

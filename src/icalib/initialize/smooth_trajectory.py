@@ -88,7 +88,7 @@ MEDIAN_CHI2_OF_3 = 2.366  # median of chi^2 with three degrees of freedom
 class SmoothTrajectory:
     """The trajectory at seconds (m,): R_world_body (m, 3, 3), p_world_body (m, 3) m, angular rate (m, 3) rad/s in body
     axes, velocity (m, 3) m/s in world axes, acceleration (m, 3) m/s^2 in body axes. near (m,): whether poses on both
-    sides lie within the window."""
+    sides lie within the window. acceleration_variance (m,): of each axis, by the known noise of the positions."""
 
     seconds: np.ndarray
     rotation: np.ndarray
@@ -97,40 +97,50 @@ class SmoothTrajectory:
     velocity: np.ndarray
     acceleration: np.ndarray
     near: np.ndarray
+    acceleration_variance: np.ndarray
 
 
 @dataclass(frozen=True)
 class BodyPoses:
     """Poses of the body in one recording: seconds (n,) since the first stamp of its clock, R_world_body (n, 3, 3),
-    p_world_body (n, 3) m."""
+    p_world_body (n, 3) m. variance (n,): of each axis of the position [m^2] by known noise; None if poses are alike."""
 
     seconds: np.ndarray
     rotation: np.ndarray
     position: np.ndarray
+    variance: np.ndarray | None = None
 
     def at(self, seconds: np.ndarray, narrow: bool = False) -> SmoothTrajectory:
         """The smoothed trajectory at `seconds` (m,), see `smooth_trajectory`."""
-        return smooth_trajectory(self.seconds, self.rotation, self.position, seconds, narrow)
+        return smooth_trajectory(self.seconds, self.rotation, self.position, seconds, narrow, self.variance)
 
 
 def smooth_trajectory(
-    t: np.ndarray, R: np.ndarray, p: np.ndarray, at: np.ndarray, narrow: bool = False
+    t: np.ndarray,
+    R: np.ndarray,
+    p: np.ndarray,
+    at: np.ndarray,
+    narrow: bool = False,
+    variance: np.ndarray | None = None,
 ) -> SmoothTrajectory:
     """Smooths poses R (n, 3, 3), p (n, 3) at increasing t (n,) s, and evaluates them at `at` (m,) s. Needs
-    MIN_PARABOLA_POSES poses. narrow: uses the smallest window, which keeps all of the motion and more of the noise."""
+    MIN_PARABOLA_POSES poses. narrow: uses the smallest window, which keeps all of the motion and more of the noise.
+    variance: see `BodyPoses`."""
     half = _min_half_window(t) if narrow else _half_window(t, R, p)
     first, last = np.searchsorted(t, at - half - SAME_INSTANT_S), np.searchsorted(t, at + half + SAME_INSTANT_S)
     few = last - first < MIN_PARABOLA_POSES
     middle = np.clip(np.searchsorted(t, at) - MIN_PARABOLA_POSES // 2, 0, len(t) - MIN_PARABOLA_POSES)
     first, last = np.where(few, middle, first), np.where(few, middle + MIN_PARABOLA_POSES, last)
     near = ~few & (t[first] <= at) & (t[last - 1] >= at)
-    fitted = np.empty((len(at), 3, 6))
+    fitted, curvature_variance = np.empty((len(at), 3, 6)), np.empty(len(at))
     reference = np.clip(np.searchsorted(0.5 * (t[1:] + t[:-1]), at), 0, len(t) - 1)
-    _parabolas(t, R, p, at, first, last, reference, half, fitted)
+    variance = np.zeros(len(t)) if variance is None else variance
+    _parabolas(t, R, p, variance, at, first, last, reference, half, fitted, curvature_variance)
     turn, position = fitted[:, 0, :3], fitted[:, 0, 3:]
     rotation = R[reference] @ so3.exp_many(np.ascontiguousarray(turn))
     acceleration = np.einsum("mji,mj->mi", rotation, fitted[:, 2, 3:])
-    return SmoothTrajectory(at, rotation, position, fitted[:, 1, :3], fitted[:, 1, 3:], acceleration, near)
+    rate, velocity = fitted[:, 1, :3], fitted[:, 1, 3:]
+    return SmoothTrajectory(at, rotation, position, rate, velocity, acceleration, near, curvature_variance)
 
 
 def _min_half_window(t: np.ndarray) -> float:
@@ -155,7 +165,8 @@ def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
         full = last - first >= MIN_PARABOLA_POSES
         fitted = np.zeros((len(at), 3, 6))
         reference = np.clip(np.searchsorted(t, at), 0, len(t) - 1)
-        _parabolas(t, R, p, at, first, np.where(full, last, first + MIN_PARABOLA_POSES), reference, half, fitted)
+        last = np.where(full, last, first + MIN_PARABOLA_POSES)
+        _parabolas(t, R, p, np.zeros(len(t)), at, first, last, reference, half, fitted, np.empty(len(at)))
         slopes.append(np.where(full[:, None], fitted[:, 1, :3], np.nan))
     differ = np.nanmedian(((slopes[1] - slopes[0]) ** 2).sum(axis=1)) / MEDIAN_CHI2_OF_3
     third = np.sqrt(max(differ - 1.3125 * noise**2 * dt / h**3, 0.0)) / (0.3 * h**2)
@@ -164,13 +175,14 @@ def _half_window(t: np.ndarray, R: np.ndarray, p: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _parabolas(t, R, p, at, first, last, reference, half, out):
+def _parabolas(t, R, p, variance, at, first, last, reference, half, out, curvature_variance):
     """Fits a parabola around each instant at[m], to poses first[m]..last[m]. Fills out (m, 3, 6) with value, slope and
     curvature of rotation vectors relative to R[reference[m]] and of positions. The slope of the rotation is the angular
-    rate in body axes."""
+    rate in body axes. Fills curvature_variance (m,), of the positions, by their variance (n,)."""
     row, y = np.empty(3), np.empty(6)
     for m in range(len(at)):
-        A, b = np.zeros((3, 3)), np.zeros((3, 6))
+        A, V, b = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 7))
+        b[2, 6] = 1.0  # the last column of x is row 2 of the inverse of A, the curvature's
         R0 = R[reference[m]]
         for i in range(first[m], last[m]):
             u = (t[i] - at[m]) / half
@@ -181,9 +193,14 @@ def _parabolas(t, R, p, at, first, last, reference, half, out):
             for a in range(3):
                 for c in range(3):
                     A[a, c] += row[a] * row[c]
+                    V[a, c] += variance[i] * row[a] * row[c]
                 for c in range(6):
                     b[a, c] += row[a] * y[c]
         x = np.linalg.solve(A, b)
+        curvature_variance[m] = 0.0
+        for a in range(3):
+            for c in range(3):
+                curvature_variance[m] += x[a, 6] * V[a, c] * x[c, 6] / half**4
         for c in range(6):
             out[m, 0, c], out[m, 1, c], out[m, 2, c] = x[0, c], x[1, c] / half, x[2, c] / (half * half)
         J = so3.right_jacobian(out[m, 0, :3])

@@ -292,6 +292,21 @@ def test_corners_on_a_line_have_no_pose_and_stop_nothing(simulation: Simulation)
     assert not poses.ok.any()
 
 
+def test_the_uncertainty_of_a_position_is_its_scatter(simulation: Simulation):
+    stream, rng = simulation.measurements.cameras[0], np.random.default_rng(0)
+    truth, target = simulation.truth.values["cam0"], FlatPoints(simulation.scenario.target.points)
+    lens = (
+        camera_model(rig_for(simulation.scenario).cameras[0].model),
+        np.concatenate([truth["intrinsics"], truth["distortion"]]),
+    )
+    noisy = (dataclasses.replace(stream, uv=stream.uv + 0.1 * rng.standard_normal(stream.uv.shape)) for _ in range(100))
+    positions = [target_poses(x, *lens, target).position for x in noisy]
+    scatter = np.sqrt(np.var(positions, axis=0).mean(axis=1))
+    poses = target_poses(stream, *lens, target)
+    ratio = (scatter / (0.1 * poses.per_px))[poses.ok]
+    assert np.median(ratio) == pytest.approx(1.0, rel=0.05) and np.quantile(ratio, 0.95) < 1.3
+
+
 def test_a_focal_length_is_found_where_all_trials_explain_the_corners_alike():
     """Through strong distortion every trial is off by 2.5 px on this motion; the best, by chance, is far too short."""
     base = handheld(40.0)

@@ -114,13 +114,13 @@ class CameraInitializer(Initializer[Camera]):
         cameras_only = rig.only(*(c.name for c in rig.cameras))
         inputs = inputs_for(cameras_only, [m.only(*cameras_only.sensors) for m in recordings])
         (guess,) = initial_guesses(cameras_only, inputs.bodies, [m.measurements for m in inputs.motions])
-        t, R, p = guess.body_poses(inputs.measurements)
+        t, *of_poses = guess.body_poses(inputs.measurements)
         recording = np.searchsorted([part.begin for part in inputs.parts], t, side="right") - 1
         poses = []
         for k, (part, m) in enumerate(zip(inputs.parts, recordings, strict=True)):
             # the first images are not used where their tags are not seen together with the others
             unused = 1e-9 * (part.measurements.origin_ns - m.origin_ns)
-            poses.append(BodyPoses(*(x[recording == k] for x in (t - part.begin + unused, R, p))))
+            poses.append(BodyPoses(*(x[recording == k] for x in (t - part.begin + unused, *of_poses))))
         return BodyTrajectory(poses, guess.values())
 
     def explained(self, failed: FailedEstimate) -> EstimationError | None:

@@ -157,7 +157,7 @@ def _poses(motion: WindowMotion, times: np.ndarray, R_imu_cam: np.ndarray, p_imu
     imu = motion.gyro.imu
     R, p = motion.poses(times)
     inside = (times >= imu.seconds[0]) & (times <= imu.seconds[-1])
-    return TargetPoses(R @ R_imu_cam, p + R @ p_imu_cam, inside, np.zeros(len(times)))
+    return TargetPoses(R @ R_imu_cam, p + R @ p_imu_cam, inside, np.zeros(len(times)), np.zeros(len(times)))
 
 
 MOTION_WINDOW_S = 4.0  # s; over longer windows gravity rotates in the drifting gyroscope frame

@@ -91,13 +91,14 @@ class Guess:
         """(n, 6) gyroscope and accelerometer biases, the same at all n keyframes."""
         return np.tile(np.concatenate([self.gyro_bias, self.accel_bias]), (n, 1))
 
-    def body_poses(self, measurements: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def body_poses(self, measurements: Measurements) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Poses of the body in the world, from the images of all cameras that have a pose.
 
         Returns instants (n,) [s] on the body's clock, strictly increasing, R_world_body (n, 3, 3) and p_world_body
-        (n, 3) [m]. Images at most `MIN_IMAGE_SPACING_S` after another one are left out.
+        (n, 3) [m], and its variance (n,) [m^2] by noise of the corners. Images at most `MIN_IMAGE_SPACING_S` after
+        another one are left out.
         """
-        times, rotations, positions = [], [], []
+        times, rotations, positions, variances = [], [], [], []
         for stream in measurements.cameras:
             c = self.cameras[stream.name]
             ok = c.poses.ok
@@ -105,10 +106,12 @@ class Guess:
             times.append(stream.seconds[ok] + c.offset)
             rotations.append(self.R_world_board @ R)
             positions.append((c.poses.position[ok] - R @ c.position) @ self.R_world_board.T)
+            variances.append((c.poses.per_px[ok] * np.median(c.poses.rms_px[ok])) ** 2)
         t = np.concatenate(times)
         order = np.argsort(t, kind="stable")
         order = order[np.diff(t[order], prepend=-np.inf) > MIN_IMAGE_SPACING_S]
-        return t[order], np.concatenate(rotations)[order], np.concatenate(positions)[order]
+        R, p, variance = (np.concatenate(x)[order] for x in (rotations, positions, variances))
+        return t[order], R, p, variance
 
 
 def relative_offset(value: np.ndarray, stream: CornerStream | TrackStream, measurements: Measurements) -> float:

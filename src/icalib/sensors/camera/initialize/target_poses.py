@@ -29,12 +29,14 @@ POSES_PER_BLOCK = 512  # poses computed at once: bounds the memory of rays and J
 @dataclass(frozen=True)
 class TargetPoses:
     """Camera poses in the board frame: R_board_cam (M, 3, 3), p_board_cam (M, 3) m; ok (M,) bool; rms_px (M,): RMS
-    reprojection error."""
+    reprojection error; per_px (M,) m: RMS standard deviation of the position over its axes, if that of corners is a
+    pixel."""
 
     rotation: np.ndarray
     position: np.ndarray
     ok: np.ndarray
     rms_px: np.ndarray
+    per_px: np.ndarray
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -130,7 +132,8 @@ def refine_pose(points, observed, R, t, rounds):
     z, y / z, and pixels per unit of these.
 
     Returns the RMS error [px] before the last step, with errors capped at 4 POSE_HUBER_PX; points behind the camera
-    count as this much. Returns 1e9 if singular, or if fewer than 4 points are in front of the camera.
+    count as this much. Returns 1e9 if singular, or if fewer than 4 points are in front of the camera. Also returns
+    `per_px` of `TargetPoses`.
     """
     rms, X, J, H, g = 1e9, np.empty(3), np.empty((2, 6)), np.empty((6, 6)), np.empty(6)
     for _ in range(rounds):
@@ -150,11 +153,15 @@ def refine_pose(points, observed, R, t, rounds):
             _add_corner(X, iz, density, r0, r1, 1.0 if e <= POSE_HUBER_PX else POSE_HUBER_PX / e, J, H, g)
         rms = np.sqrt(total / (2 * len(points)))
         if len(points) - behind < 4:
-            return 1e9
+            return 1e9, 0.0
         if not solve_definite(H, g):
-            return 1e9
+            return 1e9, 0.0
         _apply_step(so3.exp(-g[:3]), g, R, t)
-    return rms
+    # The inverse of the Cholesky factor's last block L has the squares sum to the trace of the position's covariance.
+    a, b, c = 1.0 / H[3, 3], 1.0 / H[4, 4], 1.0 / H[5, 5]
+    d, e = -H[4, 3] * a * b, -H[5, 4] * b * c
+    f = -(H[5, 3] * a + H[5, 4] * d) * c
+    return rms, np.sqrt((a * a + b * b + c * c + d * d + e * e + f * f) / 3.0)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -206,9 +213,9 @@ def _mirrored_pose(centre, R, t):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms):
-    """Fills poses (n, 1 or 2, ...) and RMS errors [px] of the images. If there are two, the mirrored solution is
-    second."""
+def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, rotation, position, rms, per_px):
+    """Fills poses (n, 1 or 2, ...), RMS errors [px], and `per_px` of `TargetPoses`. If there are two, the mirrored
+    solution is second."""
     R, t, h, centre = np.empty((3, 3)), np.empty(3), np.empty(9), np.empty(2)
     points, observed = np.empty((MAX_POSE_CORNERS, 3)), np.empty((MAX_POSE_CORNERS, 3))
     for i in range(len(start) - 1):
@@ -228,7 +235,7 @@ def _poses_of_images(start, point, rays, density, good, target, fewest, rounds, 
         for turn in range(rms.shape[1]):
             if turn == 1:
                 _mirrored_pose(centre, R, t)
-            rms[i, turn] = refine_pose(points[:count], observed[:count], R, t, rounds)
+            rms[i, turn], per_px[i, turn] = refine_pose(points[:count], observed[:count], R, t, rounds)
             if not rms[i, turn] < 1e9:  # corners on a line, or in one point
                 rms[i, turn] = 1e9
                 break
@@ -248,7 +255,7 @@ def target_poses(stream: CornerStream, model: CameraModel, params: np.ndarray, t
     corners each."""
     fewest = np.full(len(stream.stamps_ns), target.fewest)
     poses = flat_poses(stream, stream.start, fewest, model, params, target.points, 1)
-    return TargetPoses(poses.rotation[:, 0], poses.position[:, 0], poses.ok[:, 0], poses.rms_px[:, 0])
+    return TargetPoses(*(x[:, 0] for x in (poses.rotation, poses.position, poses.ok, poses.rms_px, poses.per_px)))
 
 
 def camera_rates(stream: CornerStream, poses: TargetPoses) -> SensorRates:
@@ -298,7 +305,7 @@ def flat_poses(
     small body far away looks alike from both poses."""
     n = len(start) - 1
     rotation, position = np.tile(np.eye(3), (n, sides, 1, 1)), np.zeros((n, sides, 3))
-    rms = np.empty((n, sides))
+    rms, per_px = np.empty((n, sides)), np.zeros((n, sides))
     for a in range(0, n, POSES_PER_BLOCK):
         i = slice(a, min(a + POSES_PER_BLOCK, n))
         rows = slice(int(start[i.start]), int(start[i.stop]))
@@ -315,8 +322,9 @@ def flat_poses(
             rotation[i],
             position[i],
             rms[i],
+            per_px[i],
         )
-    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms)
+    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms, per_px)
 
 
 def usable_rays(uv: np.ndarray, model: CameraModel, params: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -108,7 +108,8 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
     R_sb, p_sb = scene.bodies.poses(scene.values)
     rays, density, good = usable_rays(stream.uv, model, params)
     n = len(stream.stamps_ns)
-    rotation, position, rms = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3)), np.full(n, NO_POSE_RMS_PX)
+    rotation, position = np.tile(np.eye(3), (n, 1, 1)), np.zeros((n, 3))
+    rms, per_px = np.full(n, NO_POSE_RMS_PX), np.zeros(n)
     first_view = np.searchsorted(views.image, np.arange(n + 1))
     _best_poses(
         stream.start,
@@ -127,8 +128,9 @@ def multi_body_poses(stream: CornerStream, model: CameraModel, params: np.ndarra
         rotation,
         position,
         rms,
+        per_px,
     )
-    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms)
+    return TargetPoses(rotation, position, rms < MAX_POSE_RMS_PX, rms, per_px)
 
 
 @njit(cache=True, nogil=True)
@@ -145,9 +147,11 @@ def _compose(R_ab, p_ab, R_bc, p_bc, R_ac, p_ac):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _best_poses(
-    start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms
-):
-    """Writes camera poses in the scene and errors of M images: rotation (M, 3, 3), position (M, 3) m, rms (M,) px.
+    start, point, rays, density, good, scene_points, first, body, R_bc, p_bc, ok, R_sb, p_sb, rotation, position, rms,
+    per_px,
+):  # fmt: skip
+    """Writes camera poses in the scene and errors of M images: rotation (M, 3, 3), position (M, 3) m, rms (M,) px,
+    per_px (M,) m, see `TargetPoses`.
 
     Candidates are the poses T_body_cam of the views, R_bc, p_bc, ok (V, 2, ...), composed with T_scene_body, R_sb,
     p_sb. The candidate with the least error over all corners of the image is refined on all of them."""
@@ -163,12 +167,12 @@ def _best_poses(
                     continue
                 _compose(R_sb[body[v]], p_sb[body[v]], R_bc[v, side], p_bc[v, side], R_sc, p_sc)
                 camera_in_target(R_sc, p_sc, trial_R, trial_t)
-                error = refine_pose(points[:count], observed[:count], trial_R.copy(), trial_t.copy(), 1)
+                error = refine_pose(points[:count], observed[:count], trial_R.copy(), trial_t.copy(), 1)[0]
                 if error < best:
                     best = error
                     R[:], t[:] = trial_R, trial_t
         if best < NO_POSE_RMS_PX:
-            rms[i] = refine_pose(points[:count], observed[:count], R, t, POSE_ITERATIONS)
+            rms[i], per_px[i] = refine_pose(points[:count], observed[:count], R, t, POSE_ITERATIONS)
             if rms[i] < NO_POSE_RMS_PX:
                 camera_in_target(R, t, rotation[i], position[i])
             else:

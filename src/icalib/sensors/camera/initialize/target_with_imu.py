@@ -201,7 +201,7 @@ def initial_trajectory(
     imu = imu_data(rig, measurements)
     if imu is None:
         return trajectory_without_imu(guess, measurements, keyframes)
-    t, R, p = guess.body_poses(measurements)
+    t, R, p, _ = guess.body_poses(measurements)
 
     def position(s: np.ndarray) -> np.ndarray:
         return np.stack([np.interp(s, t, p[:, k]) for k in range(3)], axis=1)
@@ -366,7 +366,7 @@ def trajectory_without_imu(
 
     Each pose is that of the nearest image; velocities are zero.
     """
-    t, R, p = guess.body_poses(measurements)
+    t, R, p, _ = guess.body_poses(measurements)
     nearest = np.searchsorted(0.5 * (t[1:] + t[:-1]), keyframes)
     return np.ascontiguousarray(R[nearest]), p[nearest], np.zeros((len(keyframes), 3))
 
