@@ -28,6 +28,7 @@ from icalib.result import Calibration
 from icalib.rig import Parameter, PoseSensor, Rig
 from icalib.sensors.imu.spec import class_imperfections
 from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.lidar.spec import RANGE_SCALE
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.montecarlo.record import error, true_value
@@ -46,7 +47,7 @@ IMU_EFFECTS = {
     "accelerometer rotation": [12, 13, 14],
     "g-sensitivity": list(range(15, 24)),
 }
-SIZE, SCALE, NONE = "target size", "scale of poses", "none"
+SIZE, SCALE, RANGES, NONE = "target size", "scale of poses", "scale of ranges", "none"
 ENCODER = 0.005  # rad/sqrt(s): with the paper's 0.03 it is chance whether hills show how wheels roll
 ON_WALL = np.array([[0.0, 0.0, -1.0, 5.9], [-1.0, 0.0, 0.0, 3.9], [0.0, 1.0, 0.0, 0.1], [0.0, 0.0, 0.0, 1.0]])
 MOUNT = ("rotation", "translation", "time_offset")
@@ -85,6 +86,12 @@ def lidar_imu() -> Scenario:
     return replace(scenario, duration_s=10.0, cameras=(), features=None, sensors=lidars)
 
 
+def lidar_poses_imu() -> Scenario:
+    """That LiDAR, with motion capture."""
+    scenario = lidar_imu()
+    return replace(scenario, sensors=(*scenario.sensors, _mocap()))
+
+
 def poses_imu() -> Scenario:
     """Motion capture of a body that moves freely, 10 s."""
     room, motion = Room((8.0, 6.0, 3.0)), Drive("free")
@@ -120,7 +127,8 @@ class Kind:
 KINDS = {
     "camera + IMU": Kind(camera_imu, True, (*IMU_EFFECTS, SIZE)),
     "tracks + IMU": Kind(tracks_imu, True, tuple(IMU_EFFECTS)),
-    "LiDAR + IMU": Kind(lidar_imu, True, tuple(IMU_EFFECTS)),
+    "LiDAR + IMU": Kind(lidar_imu, True, (*IMU_EFFECTS, RANGES)),
+    "LiDAR + poses + IMU": Kind(lidar_poses_imu, True, (SCALE, RANGES)),
     "poses + IMU": Kind(poses_imu, True, (*IMU_EFFECTS, SCALE)),
     "wheels + poses + IMU": Kind(wheels_poses_imu, True, (*IMU_EFFECTS, SCALE)),
     "wheels + poses": Kind(wheels_poses_imu, False, (SCALE,)),
@@ -141,6 +149,9 @@ def with_effect(scenario: Scenario, effect: str, times: float, seed: int) -> Sce
     if effect == SCALE:
         scale = float(1.0 + times * signs[0] * PoseSensor.scale_sigma)
         return scenario.with_sensors(*(replace(p, scale=scale) for p in scenario.of(SimPoses)))
+    if effect == RANGES:
+        scale = float(1.0 + times * signs[0] * RANGE_SCALE.prior_sigma)
+        return scenario.with_sensors(*(replace(x, scale=scale) for x in scenario.of(SimLidar)))
     return scenario
 
 

@@ -62,7 +62,9 @@ def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind:
     scenario = program.with_effect(program.KINDS[kind].scenario(), effect, 1.0, 1)
     rig = program.rig_of(scenario, program.KINDS[kind])
     rig = rig.with_(imu=replace(rig.imu, intrinsics=Parameter("fixed")))
-    reasons = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated()).reasons
+    result = calibrate_measurements(rig, simulate(scenario, 1).measurements.unassociated())
+    reasons, tested = result.reasons, result.effects["imu0.intrinsics"]
+    assert (len(tested["value"]), tested["unit"]) == (24, "")
     if largest:
         assert reasons[0].name == "imu_not_ideal"
         assert f"most of all {largest} is" in reasons[0]
@@ -71,9 +73,8 @@ def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind:
 
 def poses_and_lidar(program: ModuleType, scale: float) -> Scenario:
     """Of `scale`, the ratio of true to reported ranges."""
-    scenario = program.lidar_imu()
-    lidars = tuple(replace(x, azimuth_steps=225, scale=scale) for x in scenario.of(SimLidar))
-    return replace(scenario, sensors=(*lidars, *program.poses_imu().sensors))
+    scenario = program.lidar_poses_imu()
+    return scenario.with_sensors(*(replace(x, azimuth_steps=225, scale=scale) for x in scenario.of(SimLidar)))
 
 
 @pytest.mark.parametrize("exact", [False, True])

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy import stats
@@ -410,6 +410,21 @@ class Effect:
         """Whether it differs from zero."""
         return self.chi2 > _least_chi2(len(self.value))
 
+    @property
+    def is_suspected(self) -> bool:
+        """Whether it differs from zero if nothing but white noise is left."""
+        return self.gain > _least_chi2(len(self.value))
+
+    @property
+    def plain(self) -> dict[str, Any]:
+        """Its numbers for files."""
+        return {
+            "value": self.value.tolist(),
+            "std": self.std.tolist(),
+            "labels": list(self.spec.labels),
+            "unit": self.spec.unit,
+        }
+
     def amended(self, rig: Rig) -> Rig:
         """The rig with a prior on the effect, so that it is estimated."""
         prior = Parameter("prior", np.zeros(self.spec.size), np.full(self.spec.size, self.prior_sigma))
@@ -422,8 +437,8 @@ class Effect:
 
 
 class LeftOut(NamedTuple):
-    """Effects that an estimate leaves out: all that were tested, none where none differs from zero; and shifts (n, B)
-    of the calibration parameters whose outer products add to their covariance, for those that nothing determines."""
+    """Effects that an estimate leaves out: all that were tested; and shifts (n, B) of the calibration parameters whose
+    outer products add to their covariance, for those that nothing determines."""
 
     tested: tuple[Effect, ...]
     shifts: np.ndarray
@@ -447,12 +462,10 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> LeftOut:
     shifts = _considered(inputs.layout, problem, solution.information, (specs, step, root))
     columns = {key: freed.layout.columns(*key) for key in specs}
     gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
-    if all(gain[key] < _least_chi2(len(k)) for key, k in columns.items()):
-        return LeftOut((), shifts)
     outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
-    std = np.sqrt((root**2).sum(axis=1))
-    ratio = np.ones(len(step))
-    if (parts := Segments.of(problem, outcome, rig.settings.segments)) is not None:
+    std, ratio = np.sqrt((root**2).sum(axis=1)), np.ones(len(step))
+    suspected = any(gain[key] > _least_chi2(len(k)) for key, k in columns.items())
+    if suspected and (parts := Segments.of(problem, outcome, rig.settings.segments)) is not None:
         scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
         ratio = np.maximum(1.0, np.sqrt(scattered) / std)
     others = np.setdiff1d(problem.layout.essential, np.concatenate(list(columns.values())))

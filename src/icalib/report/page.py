@@ -456,11 +456,12 @@ def fits(c: Calibration) -> Html:
 
 
 def facts(c: Calibration) -> Html:
-    """Tables of settings, versions, wall times, sensor rates and input files."""
+    """Tables of settings, effects that were tested, versions, wall times, sensor rates and input files."""
     names = ("setting", "value")
     parts: list[object] = []
     for title, values in (
         ("Settings", c.settings),
+        ("Tested, not in the model", {name: _tested_words(effect) for name, effect in c.effects.items()}),
         ("Versions", c.versions),
         ("Wall time [s]", {k: f"{v:.2f}" for k, v in c.timings.items()}),
         ("Rates [Hz]", {k: f"{v:.4g}" for k, v in c.rates.items()}),
@@ -468,6 +469,14 @@ def facts(c: Calibration) -> Html:
         parts.append(element("section", [element("h3", title), table(names, values.items())]))
     files = table(("file", "sha256"), [(name, element("code", digest)) for name, digest in c.inputs.items()])
     return Html(element("div", parts, "grid") + element("h3", "Input files") + files)
+
+
+def _tested_words(effect: dict[str, Any]) -> str:
+    """Value and standard deviation of an effect, of the number that is the largest of several."""
+    off = [abs(v) / s for v, s in zip(effect["value"], effect["std"], strict=True)]
+    k = off.index(max(off))
+    label = f"{effect['labels'][k]} " if len(off) > 1 else ""
+    return f"{label}{effect['value'][k]:.2g} ± {effect['std'][k]:.2g} {effect['unit']}"
 
 
 def size_words(c: Calibration) -> str:

@@ -183,6 +183,8 @@ class Calibration:
     planes: tuple[Plane, ...] = ()  # planes of the scene that LiDAR points lie on
     cross_validation: CrossValidation | None = None  # None if the recording could not be split
     wrong: tuple[Remark, ...] = ()  # those of `warnings` that show an error in the rig file or the recording
+    # Effects that were tested and are not in the model, by "sensor.name": value and std [unit] of each of the labels.
+    effects: dict[str, dict[str, Any]] = field(default_factory=dict)
     # Known only where the calibration is made, not where it is loaded: rotation, translation and time offset of each
     # sensor in the first guess, if a LiDAR is in the rig; and pictures for the report.
     first_guess: Mapping[tuple[str, str], np.ndarray] = field(default_factory=dict)

@@ -103,6 +103,7 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "identifiers": {name: [r.name for r in getattr(c, name)] for name in ("reasons", *_REMARKS)},
         **{name: getattr(c, name) for name in _PLAIN},
         "made": c.made,
+        "effects": c.effects,
     }
 
 
@@ -193,6 +194,7 @@ def _build(plain: dict[str, Any], arrays: dict[str, np.ndarray]) -> Calibration:
         **{name: _remarks(plain, name) for name in _REMARKS},
         **{name: plain[name] for name in _PLAIN},
         made=str(plain.get("made", "")),  # earlier results have none
+        effects=plain.get("effects", {}),
     )
 
 

@@ -120,6 +120,7 @@ def _calibration(assessed: AssessedEstimate, determined: Determined, observabili
         versions=versions(),
         recordings=timeline.spans,
         planes=tuple(plane for a in assessments(assessed) for plane in a.planes),
+        effects={f"{e.sensor}.{e.spec.name}": e.plain for e in assessed.effects},
         first_guess=_first_guess(inputs),
     )
 

@@ -184,7 +184,7 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool)
     causes, segments, timeline = list[Cause](), assessed.segments, assessed.timeline
     is_amiss = bool(misfit.fits) or scattering
     by_gain, clear = (), None
-    if segments is not None and (is_amiss or assessed.effects):
+    if segments is not None and (is_amiss or any(e.is_suspected for e in assessed.effects)):
         by_gain = changes(segments, assessed.inputs.sensors)
         clear = _clear_change(by_gain, scatter(segments))
     if effects := list(effect_causes(assessed, by_gain, clear)):  # the others may follow from these
