@@ -14,14 +14,14 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, with_association, with_groups
 from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma
-from icalib.estimate.residual_statistics import Segments, noise_variance, spread_variance
+from icalib.estimate.residual_statistics import Segments, calibration_columns, noise_variance, spread_variance
 from icalib.estimate.solver import Linearised, Outcome, outcome_of
 from icalib.geometry import planes, so3
 from icalib.motion.factor import Residuals
@@ -436,7 +436,7 @@ class Effect:
         return max(float(10.0 ** np.ceil(np.log10(np.abs(self.value).max()))), self.spec.prior_sigma)
 
 
-class LeftOut(NamedTuple):
+class EffectsLeftOut(NamedTuple):
     """Effects that an estimate leaves out: all that were tested; and shifts (n, B) of the calibration parameters whose
     outer products add to their covariance, for those that nothing determines."""
 
@@ -444,7 +444,7 @@ class LeftOut(NamedTuple):
     shifts: np.ndarray
 
 
-def effects_left_out(inputs: Inputs, estimate: Estimate) -> LeftOut:
+def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     """All effects that the rig file does not mention, and imperfections that it excludes, tested together; none without
     convergence."""
     rig, specs = inputs.rig, dict[Key, ParameterSpec]()
@@ -452,11 +452,11 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> LeftOut:
         for spec in () if rig.assumes_motion and s is rig.imu else (x for x in s.specs() if x.is_effect):
             if (p := getattr(s, spec.name)).mode == "fixed" and p.value is None:
                 specs[s.name, spec.name] = spec
-    freed = _with_effects(inputs, specs)
+    freed = freed_inputs(_with_effects(inputs, specs))
     specs = {key: spec for key, spec in specs.items() if freed.layout.is_free(*key)}
     unknown = [key for key, spec in specs.items() if spec.size == 1]
     if not specs or (linearised := _linearised(freed, estimate, unknown)) is None:
-        return LeftOut((), np.zeros((0, inputs.layout.size)))
+        return EffectsLeftOut((), np.zeros((0, inputs.layout.size)))
     problem, state, solution, residuals = linearised
     step, root = _newton_step(solution.information, solution.gradient[:-1], problem.tolerance, problem.fixed_directions)
     shifts = _considered(inputs.layout, problem, solution.information, (specs, step, root))
@@ -468,28 +468,29 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> LeftOut:
     if suspected and (parts := Segments.of(problem, outcome, rig.settings.segments)) is not None:
         scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
         ratio = np.maximum(1.0, np.sqrt(scattered) / std)
+        ratio = np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))  # noise is so much larger
     others = np.setdiff1d(problem.layout.essential, np.concatenate(list(columns.values())))
     moves = float((np.abs(step[others]) / problem.tolerance[others]).max(initial=0.0))
     tested = tuple(
         Effect(key[0], specs[key], step[k], (ratio * std)[k], _chi2(step[k] / ratio[k], root[k]), gain[key], moves)
         for key, k in columns.items()
     )
-    return LeftOut(tested, shifts)
+    return EffectsLeftOut(tested, shifts)
 
 
 def _considered(
     layout: Layout,
     problem: Problem,
     information: np.ndarray,
-    found: tuple[Mapping[Key, ParameterSpec], np.ndarray, np.ndarray],
+    effects: tuple[Mapping[Key, ParameterSpec], np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """(n, B) responses of the calibration parameters of `layout` to effects that are considered (Schmidt 1966), each as
-    large as its prior and the data together let it be. found: effects, their step and the root of its covariance in the
+    large as its prior and the data together let it be. effects: with their step and the root of its covariance, in the
     larger layout of `problem`, with `information`."""
-    specs, step, root = found
+    specs, step, root = effects
     t, n = problem.tolerance, problem.layout.size
-    effects = np.concatenate([problem.layout.columns(*key) for key in specs])
-    known = np.hstack([problem.fixed_directions.reshape(n, -1), np.eye(n)[:, effects]])
+    columns = np.concatenate([problem.layout.columns(*key) for key in specs])
+    known = np.hstack([problem.fixed_directions.reshape(n, -1), np.eye(n)[:, columns]])
     fixed = t[:, None] * restricted_root(t[:, None] * information * t, known)
     rows = [np.zeros((0, layout.size))]
     for key in (key for key, spec in specs.items() if spec.is_considered):
@@ -510,7 +511,7 @@ def _chi2(step: np.ndarray, root: np.ndarray) -> float:
 
 def _least_chi2(m: int) -> float:
     """The chi^2 of m numbers that is as unlikely as EFFECT_SIGMAS standard deviations of one."""
-    return float(stats.chi2.isf(stats.chi2.sf(EFFECT_SIGMAS**2, 1), m))
+    return float(special.chdtri(m, special.chdtrc(1, EFFECT_SIGMAS**2)))
 
 
 def _with_effects(inputs: Inputs, tested: Collection[Key]) -> Inputs:

@@ -535,8 +535,8 @@ class BoardFactor(RowFactor):
         if self.bodies.several:
             in_scene = np.einsum("nij,nj->ni", self.bodies.poses(state.values)[0][p.body[block]], of_body)
             J_body = np.concatenate([np.cross(of_body, m.y), -in_scene], axis=1)
-            own = N_FURTHER + 6 * p.body[block][:, None] + np.arange(6)
-            J_further[np.arange(len(J_body))[:, None], 0, own] = J_body
+            of_poses = N_FURTHER + 6 * p.body[block][:, None] + np.arange(6)
+            J_further[np.arange(len(J_body))[:, None], 0, of_poses] = J_body
         J_pose = np.concatenate([np.cross(m.x, in_lidar), in_lidar], axis=1)[:, None, :]
         return rows_at(residual[:, None], (J_pose,), (at,), J_further), m.cosine
 
