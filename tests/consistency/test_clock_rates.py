@@ -78,7 +78,7 @@ CASES: dict[str, Case] = {
         planes_found,
     ),
     "poses, whose rate the recording shows": Case(
-        lambda: simulate(drifting(by_hand(POSES)), 1), [known(), rates_within(10.0, "mocap0")]
+        lambda: simulate(drifting(by_hand(POSES)), 1), [known(), rates_within(10.0, "mocap0")], with_segments
     ),
     "camera, LiDAR and wheels, whose rates the recording shows": Case(
         lambda: simulate(drifting(make_robot("3d", 20.0, "clw")), 0),

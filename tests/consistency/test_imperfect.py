@@ -67,7 +67,7 @@ def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind:
     assert (len(tested["value"]), tested["unit"]) == (24, "")
     if largest:
         assert reasons[0].name == "imu_not_ideal"
-        assert f"most of all {largest} is" in reasons[0]
+        assert f"and it is not: {largest} is" in reasons[0]
     assert not [r for r in reasons if r.name == "residuals_unexplained" or (not largest and r.name == "imu_not_ideal")]
 
 
@@ -88,6 +88,25 @@ def test_lengths_carry_the_uncertainty_of_ranges(program: ModuleType, exact: boo
     scale = result.group("mocap0", "scale")
     off = abs(float(scale.value[0]) - 1.0) / float(scale.std[0])
     assert off > 30.0 if exact else off < 4.0
+
+
+def test_what_ranges_may_be_off_adds_the_response_of_the_estimate(program: ModuleType):
+    """The covariance grows by r r^T, and r is what the estimate changes by with another scale: all by the same factor,
+    at most the prior."""
+    scenario = poses_and_lidar(program, 1.0)
+    rig = program.rig_of(scenario, program.Kind(lambda: scenario, True, ()))
+    measured = simulate(scenario, 1).measurements.unassociated()
+    scales = {"considered": Parameter("fixed")} | {x: Parameter("fixed", np.array([x])) for x in (0.0, 1e-3)}
+    found = {
+        key: calibrate_measurements(rig.with_(lidars=tuple(replace(x, range_scale=p) for x in rig.lidars)), measured)
+        for key, p in scales.items()
+    }
+    considered, exact, longer = found.values()
+    columns = not_none(exact.group("mocap0", "scale").columns)
+    grown = np.sqrt(considered.covariance[columns, columns] - exact.covariance[columns, columns])
+    moved = longer.group("mocap0", "scale").value - exact.group("mocap0", "scale").value
+    share = grown / np.abs(moved)
+    assert 0.3 < share < 1.1  # of the prior: the data alone know the scale to about the same
 
 
 def test_a_scale_of_ranges_is_found(program: ModuleType):

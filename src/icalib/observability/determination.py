@@ -68,9 +68,9 @@ class Determined:
     data, noise (B, B): information of the data in tolerance units, and the part that noise in the Jacobian adds, which
     `data` excludes. Priors on nuisance parameters are in `data`, other priors are not. fixed_directions (B, m):
     orthonormal basis of the unobservable directions, in tolerance units. shifts (n, B): changes of all calibration
-    parameters, in their units, for independent errors of the guess of one standard deviation along the fixed
-    directions. inflation: factor by which standard deviations of priors on nuisance parameters were divided, see
-    `estimate.residual_statistics.inflation`.
+    parameters, in their units, for independent errors of one standard deviation: of the guess along the fixed
+    directions, and of effects that are considered. inflation: factor by which standard deviations of priors on nuisance
+    parameters were divided, see `estimate.residual_statistics.inflation`.
     """
 
     estimate: Estimate
@@ -106,8 +106,8 @@ class Determined:
 
     @property
     def variances(self) -> tuple[np.ndarray, np.ndarray]:
-        """(B,) variances in squared tolerances: those from the data and priors on nuisance parameters, and those from
-        errors of the guess along the fixed directions (consider covariance)."""
+        """(B,) variances in squared tolerances: those from the data and priors on nuisance parameters, and those of
+        the `shifts` (consider covariance)."""
         by_data = np.diag(error_covariance(self.data, self.noise, self.fixed_directions))
         return by_data, ((self.shifts / self.estimate.problem.tolerance) ** 2).sum(axis=0)
 

@@ -4,6 +4,9 @@ A fixed direction has the value of the guesses of all parameters that it moves. 
 the prior covariance of the fixed directions. The response of all other parameters is that of the normal equations at
 the solution (implicit function theorem). Its derivative gives the second-order terms: on a plane the baseline of wheels
 changes with the square of their roll.
+
+Score tests, by one Newton step with more parameters: of values that the rig file states, and of effects that the
+estimate leaves out.
 """
 
 from __future__ import annotations
@@ -37,7 +40,7 @@ from icalib.optim.arrowhead import (
 )
 from icalib.optim.state import Block, Key, Layout, State
 from icalib.rig import Parameter, ParameterSpec, Rig, Sensor
-from icalib.sensors.sensor import ROTATION
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED_NAMES, ROTATION, TIME_OFFSET
 
 # information in tolerance units, noise in the Jacobian included; below it a direction is reset to the guess
 WEAKLY_CONSTRAINED_BELOW = 0.25
@@ -384,9 +387,9 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
     return out
 
 
-# Effects that the estimate leaves out: parameters that are zero, as sensors are ideal, and not estimated.
+# Effects: parameters that are zero for an ideal sensor, and that the estimate does not have.
 
-EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero; with several numbers, as unlikely
+EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero; of several numbers: the same chance
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
@@ -394,8 +397,9 @@ WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 class Effect:
     """An effect of the whole recording, such as the rate of a clock, by a score test. value (m,): one Newton step of
     its parameters [the unit of `spec`], beside all other effects that were tested; std (m,): its standard deviations,
-    by the scatter of segments after this step; chi2: of the step, so scattered; gain: decrease of chi^2 where it is
-    estimated; moves: the largest change of another parameter, in tolerances."""
+    by the scatter of segments after this step where an effect is suspected. chi2: of the step, with this covariance, 0
+    if there are no segments; gain: decrease of chi^2 where it is estimated, for white noise. moves: the largest change
+    of a parameter of the estimate by this effect alone, in tolerances."""
 
     sensor: str
     spec: ParameterSpec
@@ -418,12 +422,8 @@ class Effect:
     @property
     def plain(self) -> dict[str, Any]:
         """Its numbers for files."""
-        return {
-            "value": self.value.tolist(),
-            "std": self.std.tolist(),
-            "labels": list(self.spec.labels),
-            "unit": self.spec.unit,
-        }
+        numbers = {"value": self.value.tolist(), "std": self.std.tolist()}
+        return numbers | {"labels": list(self.spec.labels), "unit": self.spec.unit}
 
     def amended(self, rig: Rig) -> Rig:
         """The rig with a prior on the effect, so that it is estimated."""
@@ -438,70 +438,137 @@ class Effect:
 
 class EffectsLeftOut(NamedTuple):
     """Effects that an estimate leaves out: all that were tested; and shifts (n, B) of the calibration parameters whose
-    outer products add to their covariance, for those that nothing determines."""
+    outer products add to their covariance, one for each effect that is considered."""
 
     tested: tuple[Effect, ...]
     shifts: np.ndarray
 
 
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
-    """All effects that the rig file does not mention, and imperfections that it excludes, tested together; none without
-    convergence."""
-    rig, specs = inputs.rig, dict[Key, ParameterSpec]()
-    for s in rig.sensors.values() if estimate.outcome.converged else ():
-        for spec in () if rig.assumes_motion and s is rig.imu else (x for x in s.specs() if x.is_effect):
-            if (p := getattr(s, spec.name)).mode == "fixed" and p.value is None:
-                specs[s.name, spec.name] = spec
-    freed = freed_inputs(_with_effects(inputs, specs))
+    """All effects that the rig file does not mention, and IMU intrinsics that it fixes without a value, tested
+    together; none without convergence."""
+    specs = _testable(inputs) if estimate.outcome.converged else {}
+    freed = _with_effects(inputs, specs)
     specs = {key: spec for key, spec in specs.items() if freed.layout.is_free(*key)}
-    unknown = [key for key, spec in specs.items() if spec.size == 1]
-    if not specs or (linearised := _linearised(freed, estimate, unknown)) is None:
+    single = [key for key, spec in specs.items() if spec.size == 1]
+    if not specs or (linearised := _linearised(freed, estimate, single)) is None:
         return EffectsLeftOut((), np.zeros((0, inputs.layout.size)))
-    problem, state, solution, residuals = linearised
-    step, root = _newton_step(solution.information, solution.gradient[:-1], problem.tolerance, problem.fixed_directions)
-    shifts = _considered(inputs.layout, problem, solution.information, (specs, step, root))
-    columns = {key: freed.layout.columns(*key) for key in specs}
-    gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
-    outcome = outcome_of(Linearised(problem, state, 0.0, residuals), 0.0, [], solution)
-    std, ratio = np.sqrt((root**2).sum(axis=1)), np.ones(len(step))
-    suspected = any(gain[key] > _least_chi2(len(k)) for key, k in columns.items())
-    if suspected and (parts := Segments.of(problem, outcome, rig.settings.segments)) is not None:
-        scattered = spread_variance(outcome, parts.after(step), noise_variance(problem, outcome))
-        ratio = np.maximum(1.0, np.sqrt(scattered) / std)
-        ratio = np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))  # noise is so much larger
-    others = np.setdiff1d(problem.layout.essential, np.concatenate(list(columns.values())))
-    moves = float((np.abs(step[others]) / problem.tolerance[others]).max(initial=0.0))
-    tested = tuple(
-        Effect(key[0], specs[key], step[k], (ratio * std)[k], _chi2(step[k] / ratio[k], root[k]), gain[key], moves)
-        for key, k in columns.items()
-    )
-    return EffectsLeftOut(tested, shifts)
+    freed_estimate = _FreedEstimate(inputs.layout, *linearised)
+    return EffectsLeftOut(freed_estimate.effects(specs, freed), freed_estimate.considered(specs))
 
 
-def _considered(
-    layout: Layout,
-    problem: Problem,
-    information: np.ndarray,
-    effects: tuple[Mapping[Key, ParameterSpec], np.ndarray, np.ndarray],
-) -> np.ndarray:
-    """(n, B) responses of the calibration parameters of `layout` to effects that are considered (Schmidt 1966), each as
-    large as its prior and the data together let it be. effects: with their step and the root of its covariance, in the
-    larger layout of `problem`, with `information`."""
-    specs, step, root = effects
-    t, n = problem.tolerance, problem.layout.size
-    columns = np.concatenate([problem.layout.columns(*key) for key in specs])
-    known = np.hstack([problem.fixed_directions.reshape(n, -1), np.eye(n)[:, columns]])
-    fixed = t[:, None] * restricted_root(t[:, None] * information * t, known)
-    rows = [np.zeros((0, layout.size))]
-    for key in (key for key, spec in specs.items() if spec.is_considered):
-        k = problem.layout.columns(*key)[0]
-        by_data, by_prior = float((root[k] ** 2).sum()), specs[key].prior_sigma ** 2
-        weight = by_prior / (by_prior + by_data)
-        response, row = -fixed @ (fixed.T @ information[:, k]), np.zeros((1, layout.size))
-        for block in layout.free:
-            row[0, block.columns] = response[problem.layout.block(*block.key).columns]
-        rows.append(row * np.sqrt(weight * by_data + (weight * step[k]) ** 2))
-    return np.vstack(rows)
+def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
+    """The effects to test. Without a time offset a clock has no rate."""
+    rig, layout, out = inputs.rig, inputs.layout, dict[Key, ParameterSpec]()
+    for s in rig.sensors.values():
+        is_clocked = layout.has(s.name, TIME_OFFSET.name) and layout.is_free(s.name, TIME_OFFSET.name)
+        for spec in s.specs() if s is not rig.imu or not rig.assumes_motion else ():
+            p: Parameter = getattr(s, spec.name)
+            if spec.is_effect and p.mode == "fixed" and p.value is None and (is_clocked or spec != CLOCK_RATE):
+                out[s.name, spec.name] = spec
+    return out
+
+
+def _with_effects(inputs: Inputs, effects: Collection[Key]) -> Inputs:
+    """The inputs with `effects` estimated: with the prior of their class, or without one. Fixed values get the prior of
+    a guess, so that an effect is named only where a wrong value does not explain it."""
+    rig = inputs.rig
+    body = rig.reference_without_imu if rig.imu is None or rig.assumes_motion else ""
+    frame = [(body, name) for name in MOUNTED_NAMES]  # that of the body is no stated value
+
+    def estimated(sensor: Sensor, spec: ParameterSpec) -> Parameter:
+        p: Parameter = getattr(sensor, spec.name)
+        if (key := (sensor.name, spec.name)) in effects:
+            usual = getattr(type(sensor), spec.name)
+            return Parameter() if usual.mode == "fixed" else usual
+        if p.mode != "fixed" or p.value is None or key in frame:
+            return p
+        return Parameter("prior", p.value, np.full(p.size, spec.prior_sigma))
+
+    changed = []
+    for s in rig.sensors.values():
+        groups = [spec for spec in s.specs() if spec.name in vars(s)]  # others follow from fields
+        changed.append(replace(s, **{spec.name: estimated(s, spec) for spec in groups}))
+    return with_association(replace(inputs, rig=rig.with_sensors(*changed)), inputs.association)
+
+
+class _FreedEstimate(NamedTuple):
+    """Normal equations at the solution of an estimate with the layout `before`, with effects and fixed values free."""
+
+    before: Layout
+    problem: Problem
+    state: State
+    solution: Solution
+    residuals: Residuals
+
+    def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[Effect, ...]:
+        """All of the effects `specs`, at one Newton step."""
+        step, root = self._step(self.problem.fixed_directions)
+        columns = {key: self.problem.layout.columns(*key) for key in specs}
+        gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
+        suspected = any(gain[key] > _least_chi2(len(k)) for key, k in columns.items())
+        ratio = self._scatter(step, root, freed) if suspected else np.ones(len(step))
+        std = np.sqrt((root**2).sum(axis=1)) * (np.ones(len(step)) if ratio is None else ratio)
+        out = []
+        for key, k in columns.items():
+            chi2 = 0.0 if ratio is None else _chi2(step[k] / ratio[k], root[k])
+            moves = float(np.abs(self._response(k) @ step[k] / self._tolerance).max(initial=0.0))
+            out.append(Effect(key[0], specs[key], step[k], std[k], chi2, gain[key], moves))
+        return tuple(out)
+
+    def considered(self, specs: Mapping[Key, ParameterSpec]) -> np.ndarray:
+        """(n, B) responses of the calibration parameters to effects that are considered (Schmidt 1966). Each is as
+        large as the RMS error that prior and data allow it, all fixed values being right."""
+        rows, n = [np.zeros((0, self.before.size))], self.problem.layout.size
+        for key in (key for key, spec in specs.items() if spec.is_considered):
+            k = self.problem.layout.columns(*key)
+            step, root = self._step(self._with_fixed(np.setdiff1d(np.arange(n), [*self._estimated, *k])))
+            by_data, by_prior = float((root[k] ** 2).sum()), specs[key].prior_sigma ** 2
+            weight = by_prior / (by_prior + by_data)
+            rms = np.sqrt(weight * by_data + (weight * step[k[0]]) ** 2)
+            row = np.zeros((1, self.before.size))
+            row[0, np.concatenate([b.columns for b in self.before.free])] = rms * self._response(k)[:, 0]
+            rows.append(row)
+        return np.vstack(rows)
+
+    @property
+    def _estimated(self) -> np.ndarray:
+        """Columns of the parameters that the estimate has, in the order of `before`."""
+        return np.concatenate([np.arange(0), *(self.problem.layout.columns(*b.key) for b in self.before.free)])
+
+    @property
+    def _tolerance(self) -> np.ndarray:
+        """Of each of these; infinite for nuisance parameters."""
+        essential = np.isin(self._estimated, self.problem.layout.essential)
+        return np.where(essential, self.problem.tolerance[self._estimated], np.inf)
+
+    def _with_fixed(self, columns: np.ndarray) -> np.ndarray:
+        """Fixed directions with `columns`."""
+        n = self.problem.layout.size
+        return np.hstack([self.problem.fixed_directions.reshape(n, -1), np.eye(n)[:, columns]])
+
+    def _step(self, fixed_directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `_newton_step`."""
+        gradient = self.solution.gradient[:-1]
+        return _newton_step(self.solution.information, gradient, self.problem.tolerance, fixed_directions)
+
+    def _response(self, columns: np.ndarray) -> np.ndarray:
+        """(B, m) derivative of the parameters that the estimate has by those with `columns` (m,); others are held."""
+        n = self.problem.layout.size
+        _, root = self._step(self._with_fixed(np.setdiff1d(np.arange(n), self._estimated)))
+        return -(root @ (root.T @ self.solution.information[:, columns]))[self._estimated]
+
+    def _scatter(self, step: np.ndarray, root: np.ndarray, freed: Inputs) -> np.ndarray | None:
+        """(B,) ratios of standard deviations, by the scatter of segments after `step` and by white noise; at least that
+        of all parameters that matter together. None without segments."""
+        outcome = outcome_of(Linearised(self.problem, self.state, 0.0, self.residuals), 0.0, [], self.solution)
+        if (parts := Segments.of(self.problem, outcome, freed.rig.settings.segments)) is None:
+            return None
+        scattered = spread_variance(outcome, parts.after(step), noise_variance(self.problem, outcome))
+        variance, ratio = (root**2).sum(axis=1), np.ones(len(step))
+        np.divide(scattered, variance, out=ratio, where=variance > 0.0)  # 0: fixed
+        ratio = np.sqrt(np.maximum(ratio, 1.0))
+        return np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))
 
 
 def _chi2(step: np.ndarray, root: np.ndarray) -> float:
@@ -512,17 +579,3 @@ def _chi2(step: np.ndarray, root: np.ndarray) -> float:
 def _least_chi2(m: int) -> float:
     """The chi^2 of m numbers that is as unlikely as EFFECT_SIGMAS standard deviations of one."""
     return float(special.chdtri(m, special.chdtrc(1, EFFECT_SIGMAS**2)))
-
-
-def _with_effects(inputs: Inputs, tested: Collection[Key]) -> Inputs:
-    """The inputs with the groups `tested` estimated: with the prior of their class, or without one."""
-
-    def default(sensor: Sensor, name: str) -> Parameter:
-        usual: Parameter = getattr(type(sensor), name)
-        return Parameter() if usual.mode == "fixed" else usual
-
-    of_sensors: dict[str, dict[str, Parameter]] = {}
-    for sensor, name in tested:
-        of_sensors.setdefault(sensor, {})[name] = default(inputs.rig.sensors[sensor], name)
-    changed = (replace(inputs.rig.sensors[name], **groups) for name, groups in of_sensors.items())
-    return with_association(replace(inputs, rig=inputs.rig.with_sensors(*changed)), inputs.association)

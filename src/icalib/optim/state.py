@@ -230,8 +230,8 @@ class Planes(NamedTuple):
     (P, 3) on each [m]. columns (P, 3 or 4): calibration columns, -1 where fixed. The third parameter is the distance;
     for the target, is_target (P,) bool, it is what a LiDAR measures too much. The fourth is the scale of its ranges.
 
-    Of points x of the LiDAR, true ones are (x - range_offset x / |x|) / (1 + range_scale). range_unit: derivative of
-    both by these parameters.
+    Points x of the LiDAR become (x - range_offset x / |x|) / (1 + range_scale): what is left of both errors since the
+    pass began. range_unit: derivative of both by the parameters, 1 / (1 + scale at the start).
     """
 
     normal: np.ndarray

@@ -183,11 +183,12 @@ class ParameterSpec:
 
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
-    explains it. is_effect: zero of an ideal sensor; where it is not estimated, whether it is zero is tested.
-    is_considered: where it is not estimated, all standard deviations include what its prior lets it be. starts_at_zero:
-    needs no guess. by_images: determined by images, not by motion. motion: advice if the data do not determine the
-    group; {axes} stands for the axes about which the rig hardly turned. motion_on_wheels, motion_without_target and
-    motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing connects the instants.
+    explains it. is_effect: zero of an ideal sensor; where the rig file gives no value, whether it is zero is tested.
+    is_considered: all standard deviations then include the response to it, as far as prior and data let it differ from
+    zero. starts_at_zero: needs no guess. by_images: determined by images, not by motion. motion: advice if the data do
+    not determine the group; {axes} stands for the axes about which the rig hardly turned. motion_on_wheels,
+    motion_without_target and motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing
+    connects the instants.
     """
 
     name: str

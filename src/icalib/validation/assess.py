@@ -406,8 +406,9 @@ class VarianceParts(NamedTuple):
     """Shares of the formal variances by source, and how much larger each part is in truth.
 
     noise, prior (B,): shares of the measurement noise and of errors of nuisance parameters; errors of the initial guess
-    along unobservable directions contribute the rest. ratio (B,): empirical over formal standard deviation of the noise
-    part. weight: factor on the standard deviation of the prior part, see `Determined.inflation`.
+    along unobservable directions, and effects that are considered, contribute the rest. ratio (B,): empirical over
+    formal standard deviation of the noise part. weight: factor on the standard deviation of the prior part, see
+    `Determined.inflation`.
     """
 
     noise: np.ndarray

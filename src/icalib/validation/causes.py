@@ -53,8 +53,8 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     omitted = {kind for a in assessments(assessed) for kind in a.unreliable}
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
-    known = stated
-    if not any_explains([c for c in stated if c.gain < np.inf], misfit) and not against:
+    known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
+    if not against and (drifts or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
         scattering = assessed.factor > LARGE_FACTOR
         known = [*stated, *varying_causes(assessed, misfit, scattering)]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])

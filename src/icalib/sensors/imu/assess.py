@@ -98,9 +98,9 @@ def causes(a: AssessedEstimate) -> Iterator[Cause]:
         if e.spec is INTRINSICS and e.differs:
             k = int(np.argmax(np.abs(e.value / e.std)))
             sentence = (
-                f"{e.sensor} is not ideal, as intrinsics: fixed says: most of all {INTRINSICS_LABELS[k]} is about "
-                f"{e.value[k]:.2g} +- {e.std[k]:.2g}. Remove intrinsics of {e.sensor} in the rig file, so that they "
-                "are estimated."
+                f"the rig file calls {e.sensor} ideal (intrinsics: fixed), and it is not: {INTRINSICS_LABELS[k]} is "
+                f"about {e.value[k]:.2g} +- {e.std[k]:.2g}, and others may differ, too. Remove intrinsics of "
+                f"{e.sensor} in the rig file, so that they are estimated."
             )
             yield Cause(Remark("imu_not_ideal", sentence), e.gain, e.moves > 1.0)
 

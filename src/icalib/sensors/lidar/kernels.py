@@ -203,9 +203,9 @@ def _shorten(row, root, offset, derivative):
 
 @njit(cache=True, nogil=True, inline="always")
 def _correct_ranges(row, root, q, planes, derivative):
-    """Makes coefficients `row` (4,) of (1, x) those of points with the errors of ranges in `planes`, in lengths as the
-    LiDAR measures them: in true lengths, a larger scale would make the noise smaller. For the target, fills derivative
-    (4,), theirs by the offset."""
+    """Applies offset and scale of ranges to coefficients `row` (4,) of (1, x). Lengths are those that the LiDAR
+    measures: in true lengths, a larger scale would make the noise smaller. For the target, fills derivative (4,), that
+    of the coefficients by the offset."""
     row[0] *= 1.0 + planes.range_scale
     if planes.is_target[q]:
         _shorten(row, root, planes.range_offset, derivative)

@@ -2,8 +2,8 @@
 
     residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    for each point x at its instant t
 
-Here x is the measured point less range_offset along its beam, over 1 + range_scale. With a scale, the residual is that
-times 1 + range_scale, whose noise does not depend on the scale.
+Here x is the measured point less range_offset along its beam, over 1 + range_scale. The factor has 1 + range_scale
+times this distance, over the value at the start of a pass: its noise does not depend on the scale.
 
 This is the signed form of (24) and (25). A factor stores moments of the points (`take_moments`), computed once per
 pass: robust weights and the association with planes stay constant while the solver runs. Its rows are the four whitened

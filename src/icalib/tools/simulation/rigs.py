@@ -113,8 +113,8 @@ def _camera(scenario: Scenario, sim: SimCamera) -> Camera:
 def _treated(
     sensor: Sensor, true: dict[str, np.ndarray], treatments: dict[str, Treatment], others: Treatment
 ) -> Sensor:
-    """The sensor with each parameter group treated as in `rig_for`; true: values by name. The rate of the clock
-    is left as it is unless it has a treatment of its own."""
+    """The sensor with each parameter group treated as in `rig_for`; true: values by name. Effects, such as
+    the rate of a clock, are left as they are unless they have a treatment of their own."""
     usual = {spec.name for spec in sensor.stated() if not spec.is_effect} | treatments.keys()
     groups = usual & true.keys()
     prefix = "imu_" if sensor.is_inertial else ""  # the intrinsics of an IMU are other parameters than those of cameras

@@ -47,18 +47,18 @@ def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     if a.inputs.association.at_rest:
         if a.inputs.rig.has_target:
-            return replace(on_boards(a), causes=scale_causes(a))
+            return replace(on_boards(a), causes=range_scale_causes(a))
         return Assessment(notes=_notes_on_patches(a))
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), scale_notes(a)),
+        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), range_scale_notes(a)),
         warnings=chain(warnings(a.inputs, a.estimate), wrong_sheets(a)),
-        causes=scale_causes(a),
+        causes=range_scale_causes(a),
     )
 
 
-def scale_causes(a: AssessedEstimate) -> Iterator[Cause]:
+def range_scale_causes(a: AssessedEstimate) -> Iterator[Cause]:
     """A cause for each LiDAR whose ranges have another scale than all other lengths. Beside a target it may be the
     target whose size is wrong."""
     for e in a.effects:
@@ -77,14 +77,14 @@ def _percent(scale: float, std: float) -> str:
     return f"{100.0 * abs(scale):.2g} +- {100.0 * std:.2g} % {'longer' if scale > 0.0 else 'shorter'}"
 
 
-def scale_notes(a: AssessedEstimate) -> Iterator[Remark]:
+def range_scale_notes(a: AssessedEstimate) -> Iterator[Remark]:
     """A note for each LiDAR whose ranges have a scale of their own in the result."""
     for g in a.groups:
         if g.name == RANGE_SCALE.name and g.columns is not None and abs(g.value[0]) > EFFECT_SIGMAS * g.std[0]:
             yield Remark(
                 "range_scale_estimated",
                 f"ranges of {g.sensor} are {_percent(float(g.value[0]), float(g.std[0]))} than true ones, which the "
-                "estimate includes; divide them where you use them, too.",
+                f"estimate includes; divide them by {1.0 + g.value[0]:.5g} where you use them, too.",
             )
 
 

@@ -126,7 +126,8 @@ def with_lidars(inputs: Inputs, state: State) -> tuple[Inputs, State]:
 
 def _after_rounds(inputs: Inputs, state: State, recordings: Sequence[tuple[LidarStream, ...]]) -> tuple[Inputs, State]:
     """Inputs and state after all rounds, see `with_lidars`. All rounds except the last use thinned points. A round is
-    repeated where its solve turns a LiDAR by more than the round assumed the state to be off."""
+    repeated where its solve turns a LiDAR by more than the round assumed the state to be off, until MOST_EARLY_ROUNDS
+    have been made."""
     step = odd_step(sum(len(s.xyz) for s in inputs.measurements.lidars), MOST_EARLY_POINTS)
     fewer = _thinned_inputs(inputs, step)
     associations: Sequence[AssociatedPlanes | None] = [None] * len(recordings)
@@ -314,8 +315,9 @@ def fitted_planes(inputs: Inputs, state: State, association: PlaneAssociation) -
     """Planes fitted to points with known planes at `state` (total least squares), as values of a state. Very large
     clouds are thinned."""
     motion, sums = motion_of(inputs, state), np.zeros((association.count, 4, 4))
-    for stream, plane in zip(inputs.measurements.lidars, association.plane, strict=True):
+    for recorded, plane in zip(inputs.measurements.lidars, association.plane, strict=True):
         if (plane >= 0).any():
+            stream = true_ranges(recorded, state)
             some = AssociatedPoints(stream, thinned(plane), np.zeros((association.count, 6)))
             moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
             _add_in_world(moments, motion, stream, sums)
