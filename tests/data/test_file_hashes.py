@@ -70,3 +70,14 @@ def test_a_bag_is_not_read_again(tmp_path: Path, name: str):
     before = hash_of(file)._at
     assert before > 0.7 * file.stat().st_size
     assert provenance([file]) == {str(file): digest(file)}
+
+
+def test_a_file_that_goes_while_it_is_hashed_fails_where_its_hash_is_asked_for(tmp_path: Path):
+    """Not in the thread that reads it, as a traceback of which nobody knows the cause."""
+    path = tmp_path / "run.db3"
+    path.write_bytes(CONTENT)
+    file_hash = hash_of(path)
+    path.unlink()
+    file_hash.read_beside()
+    with pytest.raises(FileNotFoundError):
+        file_hash.hexdigest()

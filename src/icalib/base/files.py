@@ -453,8 +453,13 @@ class FileHash:
 
     def read_beside(self) -> None:
         """Hash the file in a background thread, for readers that do not call `saw`."""
+
+        def read_on() -> None:
+            with contextlib.suppress(OSError):  # the file is gone by now; `hexdigest` says so
+                self._read_on()
+
         if self._beside is None:
-            self._beside = threading.Thread(target=self._read_on, daemon=True)
+            self._beside = threading.Thread(target=read_on, daemon=True)
             self._beside.start()
 
     def hexdigest(self) -> str:

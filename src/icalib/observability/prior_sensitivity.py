@@ -553,7 +553,7 @@ class _FreedEstimate(NamedTuple):
         return _newton_step(self.solution.information, gradient, self.problem.tolerance, fixed_directions)
 
     def _response(self, columns: np.ndarray) -> np.ndarray:
-        """(B, m) derivative of the parameters that the estimate has by those with `columns` (m,); others are held."""
+        """(B, m) derivative of the parameters that the estimate has by those with `columns` (m,); others are fixed."""
         n = self.problem.layout.size
         _, root = self._step(self._with_fixed(np.setdiff1d(np.arange(n), self._estimated)))
         return -(root @ (root.T @ self.solution.information[:, columns]))[self._estimated]
