@@ -1,20 +1,10 @@
 """What is in doubt because noise may have made it, and what noise in the Jacobians does to the rest."""
 
-from types import SimpleNamespace
-from typing import Any
-
 import numpy as np
 import pytest
 
 from icalib.estimate.jacobian_noise import Spurious
-from icalib.observability.determination import (
-    LATE,
-    _are_alike,
-    _joined,
-    _NullSpaceSearch,
-    _principal_directions,
-    error_covariance,
-)
+from icalib.observability.determination import _are_alike, _joined, _principal_directions, error_covariance
 
 DIRECTIONS = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
 TOLERANCE = np.array([1e-3, 0.1, 2.0, 0.5])
@@ -113,28 +103,3 @@ def test_of_two_null_spaces_all_is_fixed_that_is_not_in_both():
     both = _joined(axes[:, :2], other)
     np.testing.assert_allclose(both @ both.T, np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), atol=1e-12)
     np.testing.assert_array_equal(_joined(axes[:, :2], other[:, :1]), axes[:, :2])
-
-
-def test_a_search_ends_when_all_that_is_unobservable_is_fixed():
-    """Two null spaces follow each other, and a third one is found by the estimate after the sixth. It stayed free."""
-    axes = np.eye(5)
-    found: list[Any] = [SimpleNamespace(unobservable=axes[:, [k % 2 if k < LATE + 2 else 2]]) for k in range(12)]
-
-    def ended(fixed, stopped_early) -> Any:
-        outcome = SimpleNamespace(stopped_early=stopped_early, converged=True, state=None)
-        return SimpleNamespace(problem=SimpleNamespace(fixed_directions=fixed), outcome=outcome)
-
-    class Search(_NullSpaceSearch):
-        def _estimate(self, start, fixed_directions, with_guess_priors):
-            self.estimate = ended(fixed_directions, with_guess_priors)
-            self.directions = found.pop(0)
-
-        def _directions_to_reset(self, problem, state, fixed_directions):
-            return np.zeros((5, 0))
-
-    begun: Any = (*[None] * 4, ended(np.zeros((0, 0)), True), found.pop(0))
-    search = Search(*begun)
-    search.find_null_space()
-    fixed = search.estimate.problem.fixed_directions
-    np.testing.assert_allclose(fixed @ fixed.T, np.diag([1.0, 1.0, 1.0, 0.0, 0.0]), atol=1e-12)
-    assert not search.estimate.outcome.stopped_early

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -53,8 +52,7 @@ from icalib.rig import ParameterSpec
 
 # A direction may be unobservable only if less than this share of its information is left without noise in the Jacobian.
 SPURIOUS_SHARE = 0.5
-MOST_ROUNDS = 6  # resets to the mean of the priors
-LATE = 4  # round of a search from which a superset of the null space is accepted
+MOST_ROUNDS, LATE = 6, 4  # estimates of a search; the round from which a superset of the null space is accepted
 RANK_DEFICIENT_BELOW = 0.25  # information in tolerance units
 # relative change of the information below which its noise is not drawn again: few draws scatter by more
 UNCHANGED = 0.1
@@ -178,8 +176,8 @@ class _NullSpaceSearch:
     def find_null_space(self) -> None:
         """Estimates again, with the null space fixed, until it no longer changes. The guess acts as a prior until then,
         but not in the last estimate. From round LATE on nothing is freed again, and more fixed directions are accepted,
-        see `_is_same_null_space`: each round then fixes at least one direction more, so that the search ends."""
-        for k in count():
+        see `_is_same_null_space`. Otherwise the search might cycle, and end with an unobservable direction free."""
+        for k in range(MOST_ROUNDS):
             last, null_space = self.estimate, self.directions.unobservable
             unchanged = _is_same_null_space(null_space, last.problem.fixed_directions, k >= LATE)
             if unchanged and not last.outcome.stopped_early:
@@ -195,7 +193,7 @@ class _NullSpaceSearch:
                 state = project_to_guess(last.problem, state, self.guess, reset)
                 state = _adapted(last, state, fixed_directions)
             del last
-            self._estimate(state, fixed_directions, with_guess_priors=not unchanged)
+            self._estimate(state, fixed_directions, with_guess_priors=not unchanged and k + 1 < MOST_ROUNDS)
 
     def apply_priors(self) -> None:
         """Resets the state along the fixed directions to the mean of the priors that the rig file states, and
