@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -181,17 +181,19 @@ def tolerance_of(layout: Layout, specs: Mapping[Key, ParameterSpec], settings: S
 # Iteration over, and replacement of, the parameter groups of the sensors of a rig.
 
 
-def groups_of(rig: Rig) -> Iterator[tuple[Sensor, str, Parameter]]:
-    """Yields (sensor, name of the group, group) of all sensors but the IMU."""
-    for sensor in rig.mounted:
+def groups_of(rig: Rig, sensors: Collection[Sensor] | None = None) -> Iterator[tuple[Sensor, str, Parameter]]:
+    """Yields (sensor, name of the group, group) of the `sensors`; by default of all but the IMU."""
+    for sensor in rig.mounted if sensors is None else sensors:
         for name, value in vars(sensor).items():
             if isinstance(value, Parameter):
                 yield sensor, name, value
 
 
-def with_groups(rig: Rig, treated: Callable[[Sensor, str, Parameter], Parameter]) -> Rig:
-    """The rig with each group replaced by `treated(sensor, name, group)`."""
-    changed = {sensor.name: {} for sensor in rig.mounted}
-    for sensor, name, group in groups_of(rig):
-        changed[sensor.name][name] = treated(sensor, name, group)
+def with_groups(
+    rig: Rig, treated: Callable[[Sensor, str, Parameter], Parameter], sensors: Collection[Sensor] | None = None
+) -> Rig:
+    """The rig with each group of the `sensors`, see `groups_of`, replaced by `treated(sensor, name, group)`."""
+    changed: dict[str, dict[str, Parameter]] = {}
+    for sensor, name, group in groups_of(rig, sensors):
+        changed.setdefault(sensor.name, {})[name] = treated(sensor, name, group)
     return rig.with_sensors(*(replace(rig.sensors[name], **groups) for name, groups in changed.items()))

@@ -49,8 +49,8 @@ class Cause:
 @dataclass(frozen=True)
 class AssessedEstimate:
     """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
-    deviations; segments: of the recording, None if it is not split. effects: that the estimate
-    leaves out. relaxed_rig: the estimate without fixed values; None if it is not known."""
+    deviations; segments: of the recording, None if it is not split. effects: that the estimate leaves out.
+    relaxed_rig: the estimate without fixed values; None if it is not known."""
 
     inputs: Inputs
     estimate: Estimate

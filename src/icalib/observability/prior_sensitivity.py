@@ -11,12 +11,14 @@ estimate leaves out.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 from scipy.linalg import eigh
 
@@ -270,15 +272,9 @@ class Relaxed:
     def step(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
         """(B,) Newton step of the calibration parameters, and (B,) its standard deviations. The groups `freed` are free
         and without their priors; all other values stay as the rig file states them."""
-        t, n = self.problem.tolerance, self.layout.size
-        pull, known = self._priors_of(freed)
-        fixed = np.eye(n)[:, self.fixed_columns(freed)]
-        fixed_directions = (
-            np.hstack([fixed, self.problem.fixed_directions]) if self.problem.fixed_directions.size else fixed
-        )
-        step, root = _newton_step(
-            self.solution.information - known, self.solution.gradient[:-1] - pull, t, fixed_directions
-        )
+        t, (pull, known) = self.problem.tolerance, self._priors_of(freed)
+        information, gradient = self.solution.information - known, self.solution.gradient[:-1] - pull
+        step, root = _newton_step(information, gradient, t, _also_fixed(self.problem, self.fixed_columns(freed)))
         return step, np.sqrt((root**2).sum(axis=1))
 
     def without(self, freed: Collection[Key]) -> tuple[Outcome, np.ndarray]:
@@ -293,6 +289,12 @@ class Relaxed:
         """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
         priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
         return sums_of_priors(priors, self.state, self.layout.size)[1:]
+
+
+def _also_fixed(problem: Problem, columns: np.ndarray) -> np.ndarray:
+    """The fixed directions of `problem`, and `columns`, as directions."""
+    n = problem.layout.size
+    return np.hstack([np.eye(n)[:, columns], problem.fixed_directions.reshape(n, -1)])
 
 
 def _newton_step(
@@ -364,12 +366,12 @@ def freed_inputs(inputs: Inputs, keys: Collection[Key] | None = None) -> Inputs:
         wanted = p.mode == "fixed" if keys is None else (sensor.name, name) in keys
         return Parameter("free", p.value) if wanted and p.value is not None else p
 
-    return _treated(inputs, freed)
+    return _of_rig(inputs, with_groups(inputs.rig, freed))
 
 
-def _treated(inputs: Inputs, treated: Callable[[Sensor, str, Parameter], Parameter]) -> Inputs:
-    """`inputs` with each group of the rig replaced as by `with_groups`."""
-    return with_association(replace(inputs, rig=with_groups(inputs.rig, treated)), inputs.association)
+def _of_rig(inputs: Inputs, rig: Rig) -> Inputs:
+    """`inputs` with another treatment of the same sensors."""
+    return with_association(replace(inputs, rig=rig), inputs.association)
 
 
 def _is_stated(parameter: Parameter) -> bool:
@@ -476,23 +478,19 @@ def _with_effects(inputs: Inputs, effects: Collection[Key]) -> Inputs:
     body = rig.reference_without_imu if rig.imu is None or rig.assumes_motion else ""
     frame = [(body, name) for name in MOUNTED_NAMES]  # that of the body is no stated value
 
-    def estimated(sensor: Sensor, spec: ParameterSpec) -> Parameter:
-        p: Parameter = getattr(sensor, spec.name)
-        if (key := (sensor.name, spec.name)) in effects:
-            usual = getattr(type(sensor), spec.name)
+    def estimated(sensor: Sensor, name: str, p: Parameter) -> Parameter:
+        if (key := (sensor.name, name)) in effects:
+            usual = getattr(type(sensor), name)
             return Parameter() if usual.mode == "fixed" else usual
         if p.mode != "fixed" or p.value is None or key in frame:
             return p
-        return Parameter("prior", p.value, np.full(p.size, spec.prior_sigma))
+        return Parameter("prior", p.value, np.full(p.size, sensor.spec(name).prior_sigma))
 
-    changed = []
-    for s in rig.sensors.values():
-        groups = [spec for spec in s.specs() if spec.name in vars(s)]  # others follow from fields
-        changed.append(replace(s, **{spec.name: estimated(s, spec) for spec in groups}))
-    return with_association(replace(inputs, rig=rig.with_sensors(*changed)), inputs.association)
+    return _of_rig(inputs, with_groups(rig, estimated, rig.sensors.values()))
 
 
-class _FreedEstimate(NamedTuple):
+@dataclass(frozen=True)
+class _FreedEstimate:
     """Normal equations at the solution of an estimate with the layout `before`, with effects and fixed values free."""
 
     before: Layout
@@ -503,7 +501,7 @@ class _FreedEstimate(NamedTuple):
 
     def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[Effect, ...]:
         """All of the effects `specs`, at one Newton step."""
-        step, root = self._step(self.problem.fixed_directions)
+        step, root = self._step_of(np.arange(self.problem.layout.size))
         columns = {key: self.problem.layout.columns(*key) for key in specs}
         gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
         suspected = any(gain[key] > _least_chi2(len(k)) for key, k in columns.items())
@@ -519,44 +517,41 @@ class _FreedEstimate(NamedTuple):
     def considered(self, specs: Mapping[Key, ParameterSpec]) -> np.ndarray:
         """(n, B) responses of the calibration parameters to effects that are considered (Schmidt 1966). Each is as
         large as the RMS error that prior and data allow it, all fixed values being right."""
-        rows, n = [np.zeros((0, self.before.size))], self.problem.layout.size
+        rows = [np.zeros((0, self.before.size))]
         for key in (key for key, spec in specs.items() if spec.is_considered):
             k = self.problem.layout.columns(*key)
-            step, root = self._step(self._with_fixed(np.setdiff1d(np.arange(n), [*self._estimated, *k])))
+            step, root = self._step_of([*self._estimated, *k])
             by_data, by_prior = float((root[k] ** 2).sum()), specs[key].prior_sigma ** 2
             weight = by_prior / (by_prior + by_data)
             rms = np.sqrt(weight * by_data + (weight * step[k[0]]) ** 2)
-            row = np.zeros((1, self.before.size))
-            row[0, np.concatenate([b.columns for b in self.before.free])] = rms * self._response(k)[:, 0]
-            rows.append(row)
+            rows.append(rms * self._response(k).T)
         return np.vstack(rows)
 
-    @property
+    @cached_property
     def _estimated(self) -> np.ndarray:
         """Columns of the parameters that the estimate has, in the order of `before`."""
         return np.concatenate([np.arange(0), *(self.problem.layout.columns(*b.key) for b in self.before.free)])
 
-    @property
+    @cached_property
     def _tolerance(self) -> np.ndarray:
         """Of each of these; infinite for nuisance parameters."""
         essential = np.isin(self._estimated, self.problem.layout.essential)
         return np.where(essential, self.problem.tolerance[self._estimated], np.inf)
 
-    def _with_fixed(self, columns: np.ndarray) -> np.ndarray:
-        """Fixed directions with `columns`."""
-        n = self.problem.layout.size
-        return np.hstack([self.problem.fixed_directions.reshape(n, -1), np.eye(n)[:, columns]])
+    def _step_of(self, columns: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Step of the parameters with `columns`, and root of its covariance; all others are fixed."""
+        others = np.setdiff1d(np.arange(self.problem.layout.size), columns)
+        gradient, t = self.solution.gradient[:-1], self.problem.tolerance
+        return _newton_step(self.solution.information, gradient, t, _also_fixed(self.problem, others))
 
-    def _step(self, fixed_directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See `_newton_step`."""
-        gradient = self.solution.gradient[:-1]
-        return _newton_step(self.solution.information, gradient, self.problem.tolerance, fixed_directions)
+    @cached_property
+    def _root(self) -> np.ndarray:
+        """Root of the covariance of the estimate."""
+        return self._step_of(self._estimated)[1]
 
     def _response(self, columns: np.ndarray) -> np.ndarray:
         """(B, m) derivative of the parameters that the estimate has by those with `columns` (m,); others are fixed."""
-        n = self.problem.layout.size
-        _, root = self._step(self._with_fixed(np.setdiff1d(np.arange(n), self._estimated)))
-        return -(root @ (root.T @ self.solution.information[:, columns]))[self._estimated]
+        return -(self._root @ (self._root.T @ self.solution.information[:, columns]))[self._estimated]
 
     def _scatter(self, step: np.ndarray, root: np.ndarray, freed: Inputs) -> np.ndarray | None:
         """(B,) ratios of standard deviations, by the scatter of segments after `step` and by white noise; at least that

@@ -124,12 +124,8 @@ class LidarFactor(RowFactor):
     def _plane_columns(self) -> np.ndarray:
         """(P, 4) calibration columns of each plane, see `Planes`."""
         last = {TILT.name: ((self.name, RANGE_OFFSET.name),)}
-        key = self.name, RANGE_SCALE.name
-        scale = self.layout.columns(*key) if self.layout.has(*key) else np.full(1, -1)
-        of_planes = ((p, *last.get(p[1], ())) for p in self.planes)
-        return np.array(
-            [np.concatenate([*(self.layout.block(*key).columns for key in keys), scale]) for keys in of_planes]
-        )
+        of_planes = ((p, *last.get(p[1], ()), (self.name, RANGE_SCALE.name)) for p in self.planes)
+        return np.array([np.concatenate([self.layout.block(*key).columns for key in keys]) for keys in of_planes])
 
     @property
     def key(self) -> FactorKey:

@@ -109,8 +109,8 @@ class SimLidar(SimSensor):
 
     def rig_entry(self) -> Lidar:
         near, far = self.range_m
-        ranges = {"min_range_m": near, "max_range_m": far, "range_scale": EXACT}
-        return Lidar(self.name, f"{self.name}/scans.npz", self.range_noise_m, **ranges)
+        path = f"{self.name}/scans.npz"
+        return Lidar(self.name, path, self.range_noise_m, min_range_m=near, max_range_m=far, range_scale=EXACT)
 
     def record(self, stream: LidarStream, offset_ns: int) -> SimRecord:
         """Arrays, and PointCloud2 with x, y, z [m] and `time` [s] since the stamp."""

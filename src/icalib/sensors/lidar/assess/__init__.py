@@ -64,11 +64,15 @@ def range_scale_causes(a: AssessedEstimate) -> Iterator[Cause]:
     for e in a.effects:
         if e.spec is not RANGE_SCALE or not e.differs:
             continue
-        scale, advice, remedy = float(e.value[0]), "", Remedy(e.amended)
+        field, remedy = f"range_scale: {{prior: 0, sigma: {e.prior_sigma:.2g}}} for {e.sensor}.", Remedy(e.amended)
+        advice = f"Write {field}"
         if a.inputs.rig.has_target:
-            advice, remedy = "Measure the target and correct its size in the rig file. If it is right: w", None
-        words = f"{advice or 'W'}rite range_scale: {{prior: 0, sigma: {e.prior_sigma:.2g}}} for {e.sensor}."
-        sentence = f"ranges of {e.sensor} are {_percent(scale, float(e.std[0]))} than other sensors say. {words}"
+            advice, remedy = (
+                f"Measure the target and correct its size in the rig file. If it is right: write {field}",
+                None,
+            )
+        off = _percent(float(e.value[0]), float(e.std[0]))
+        sentence = f"ranges of {e.sensor} are {off} than other sensors say. {advice}"
         yield Cause(Remark("ranges_contradict", sentence), e.gain, e.moves > 1.0, remedy=remedy)
 
 
