@@ -260,6 +260,8 @@ def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
         SIZE: (one, rig.target.size_sigma * one),
         (WORLD, GRAVITY.name): (rig.gravity * one, rig.gravity_sigma * one),
     }
+    if not rig.target.size_sigma:  # exact in the estimate; a score test frees it
+        del of_scene[SIZE]
     for block in inputs.layout.free:
         stated = inputs.stated(block)
         if block.key in of_scene:

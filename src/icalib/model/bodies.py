@@ -27,15 +27,13 @@ class Bodies:
     """Bodies of a target that are in use.
 
     used: indices of the bodies, the reference first. left_out: observed bodies that share too few images with others.
-    bent: whether shapes are estimated. size: true over stated lengths of the target. sized: whether a further factor on
-    `size` is estimated.
+    bent: whether shapes are estimated. sized: whether true over stated lengths of the target are.
     """
 
     target: Target
     used: tuple[int, ...]
     left_out: tuple[int, ...] = ()
     bent: bool = False
-    size: float = 1.0
     sized: bool = False
 
     @property
@@ -62,8 +60,7 @@ class Bodies:
     def deformation(self) -> np.ndarray:
         """(n_points, s or s + 1, 3) `basis` [m], followed by the displacement per unit of the size factor if that is
         estimated."""
-        grown = self.size * self.target.points[:, None, :]
-        return np.concatenate([self.basis, grown], axis=1) if self.sized else self.basis
+        return np.concatenate([self.basis, self.target.points[:, None, :]], axis=1) if self.sized else self.basis
 
     def size_entries(self) -> list[Entry]:
         """Layout entry of the size factor, which all bodies share; empty if it is not estimated."""
@@ -105,8 +102,9 @@ class Bodies:
     def points(self, values: dict[Key, np.ndarray]) -> np.ndarray:
         """(n_points, 3) points of the target in the scene [m], shapes included. The size factor is 1 if `values` has
         none."""
-        size = self.size * values[SIZE][0] if self.sized and SIZE in values else self.size
-        points, body = size * self.target.points, self.target.body
+        points, body = self.target.points, self.target.body
+        if self.sized and SIZE in values:
+            points = values[SIZE][0] * points
         if self.bending:
             sizes = np.zeros((len(self.target.bodies), self.basis.shape[1]))
             for k in self.used:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Generic, Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -260,21 +260,3 @@ def frame_entries(
     """Layout entries of a sensor's reference frame in each recording. estimated: False if the frame is the world
     frame."""
     return [spec.entry(frame_of(sensor, k), estimated) for k in range(n_recordings) for spec in specs]
-
-
-# Interface of factors with points on the target, for any sensor.
-
-
-@runtime_checkable
-class TargetFactor(Factor, Protocol):
-    """A factor with points on `bodies` of the target. sees_target: whether it has any such point."""
-
-    @property
-    def bodies(self) -> Bodies: ...
-
-    @property
-    def sees_target(self) -> bool: ...
-
-    def with_target_size(self, size: float) -> Self:
-        """The same measurements, for a target with `size` times the stated lengths."""
-        ...

@@ -25,7 +25,7 @@ from scipy.linalg import eigh
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, with_association, with_groups
-from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma
+from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma, stated_priors
 from icalib.estimate.residual_statistics import Segments, calibration_columns, noise_variance, spread_variance
 from icalib.estimate.solver import Linearised, Outcome, outcome_of
 from icalib.geometry import planes, so3
@@ -266,7 +266,8 @@ class Relaxed:
 
     def fixed_columns(self, freed: Collection[Key]) -> np.ndarray:
         """Columns that were fixed in the estimate, except those of the groups `freed`."""
-        fixed = [b for b in self.layout.free if not self.before.is_free(*b.key) and b.key not in freed]
+        free = {*freed, *(b.key for b in self.before.free)}
+        fixed = [b for b in self.layout.free if b.key not in free]
         return np.concatenate([np.arange(0), *(b.columns for b in fixed)])
 
     def step(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
@@ -287,7 +288,7 @@ class Relaxed:
 
     def _priors_of(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
-        priors = [p for p in given_priors(self.inputs) if p.block.key in freed]
+        priors = [p for p in stated_priors(self.inputs) if p.block.key in freed]
         return sums_of_priors(priors, self.state, self.layout.size)[1:]
 
 
@@ -307,14 +308,17 @@ def _newton_step(
 
 
 def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
-    """Normal equations at the solution of `estimate`, with a column for each value that the rig file fixes.
+    """Normal equations at the solution of `estimate`, with a column for each value that the rig file fixes, and for the
+    size of the target.
 
     The state does not move, and priors still act: `Relaxed.step` frees chosen groups and drops their priors. None if
-    the rig file states no fixed value and no prior, if the solver did not converge, or if the equations are singular.
+    the rig file states none of these, if the solver did not converge, or if the equations are singular.
     """
-    if not estimate.outcome.converged or not any(_is_stated(p) for _, _, p in groups_of(inputs.rig)):
+    is_sized = bool(inputs.bodies.used)
+    is_stated = is_sized or any(_is_stated(p) for _, _, p in groups_of(inputs.rig))
+    if not estimate.outcome.converged or not is_stated:
         return None
-    freed = freed_inputs(inputs)
+    freed = freed_inputs(replace(inputs, bodies=replace(inputs.bodies, sized=is_sized)))
     if (linearised := _linearised(freed, estimate)) is None:
         return None
     problem, state, solution, residuals = linearised

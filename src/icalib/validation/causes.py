@@ -65,19 +65,18 @@ def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tup
     """Causes that are wrong values in the rig file: target size, scales, those that each kind of sensor tests, other
     values; and notes on the size."""
     inputs, factor = assessed.inputs, assessed.factor
-    size = None if inputs.rig.assumes_motion else felt_size(assessed.estimate, factor)
-    wrong_size, notes = ((), ()) if against else size_words(inputs, size)
+    relaxed_rig, given = relaxed(inputs, assessed.estimate), bool(against)
+    size = felt_size(inputs, relaxed_rig, factor)
+    wrong_size, notes = ((), ()) if given else size_words(inputs, size)
     # Other contradictions may follow from a wrong size, or from the scale of the accelerometer.
-    certain, given = is_certain(size), bool(against)
-    relaxed_rig = None if given else relaxed(inputs, assessed.estimate)
+    certain, relaxed_rig = is_certain(size), None if given else relaxed_rig
     scale = max(factor, assessed.misfit_factor)
     against = against or contradictions(inputs, relaxed_rig, scale)
     if certain:  # a wrong size also changes lever arms
         against = tuple(c for c in against if c.in_prior_sigmas > 1.0)
     causes: list[Cause] = []
     if size is not None:
-        gain = ((size.ratio - 1.0) / (size.std / factor)) ** 2
-        causes += [Cause(sentence, float(gain), certain) for sentence in wrong_size]
+        causes += [Cause(sentence, size.gain, certain) for sentence in wrong_size]
     causes += scale_causes(inputs, assessed.groups, size)
     for assessment in assessments(replace(assessed, relaxed_rig=None if certain else relaxed_rig)):
         causes += assessment.causes

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from itertools import permutations, product
+from typing import NamedTuple
 
 import numpy as np
 
 from icalib.base.remark import Remark
-from icalib.errors import EstimationError
-from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, groups_of
-from icalib.estimate.score_test import TargetSize, target_size
 from icalib.geometry import so3
 from icalib.geometry.small import is_near
 from icalib.initialize.initializer import is_contradicted
@@ -19,6 +17,7 @@ from icalib.kinds import assessors
 from icalib.model.bodies import SIZE
 from icalib.observability.assessor import Cause
 from icalib.observability.contradictions import Contradiction
+from icalib.observability.prior_sensitivity import Relaxed
 from icalib.result import ParameterGroup
 from icalib.result.verdict import UNUSABLE
 from icalib.rig import Rig
@@ -169,24 +168,38 @@ def _rounded(value: float, sigma: float) -> str:
     return f"{value:.{min(max(digits, 0), 12)}f}"
 
 
-# The size of the target as the rig file states it, compared with the size by the accelerometer.
+# The size of the target as the rig file states it, compared with the size by all measurements but the ruler, above all
+# those of the accelerometer.
 
 WRONG = 0.02  # relative error of the size: larger than that of a ruler or a good accelerometer
 BEYOND = 0.05  # relative error of the size that no accelerometer explains: these are off by 3 % at most
 CLEARLY = 5.0  # standard deviations
+UNKNOWN = 0.05  # relative standard deviation from which on the size is unobservable
 SCALE = "scale"  # name of the parameter that scales all lengths of a sensor, with the prior `scale_sigma`
 
 
-def felt_size(estimate: Estimate, factor: float) -> TargetSize | None:
-    """Ratio of the target's true size, by the accelerometer, to the stated one. `factor` multiplies its formal standard
-    deviation. None if the size is unobservable, or if the solver did not converge."""
-    if not estimate.outcome.converged:
+class TargetSize(NamedTuple):
+    """Ratio of true to stated size, and its standard deviation; gain: the decrease of chi^2 with it."""
+
+    ratio: float
+    std: float
+    gain: float
+
+
+def felt_size(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -> TargetSize | None:
+    """Ratio of the target's true size to the stated one without the prior on it, by one Newton step, and its standard
+    deviation: `factor` times the formal one, and the square of the step for what is not linear in it. None without a
+    target or an IMU, or if the size is unobservable."""
+    is_felt = inputs.bodies.used and inputs.imu is not None and not inputs.rig.assumes_motion
+    if relaxed_rig is None or not is_felt:
         return None
-    try:
-        size = target_size(estimate.problem, estimate.outcome.state)
-    except EstimationError:  # the problem cannot be solved at another size
+    step, sigma = relaxed_rig.step([SIZE])
+    (column,) = relaxed_rig.layout.columns(*SIZE)
+    if sigma[column] > UNKNOWN:
         return None
-    return None if size is None else TargetSize(size.ratio, factor * size.std)
+    ratio = float(relaxed_rig.state.values[SIZE][0] + step[column])
+    std, gain = np.hypot(factor * sigma[column], step[column] ** 2), (step[column] / sigma[column]) ** 2
+    return TargetSize(ratio, float(std), float(gain))
 
 
 def is_certain(size: TargetSize | None) -> bool:

@@ -149,11 +149,8 @@ class CornerFactor(FactorDefaults):
 
     @property
     def sees_target(self) -> bool:
-        """Whether the camera has any corner of the target, see `TargetFactor`."""
+        """Whether the camera has any corner of the target."""
         return len(self.stream.uv) > 0
-
-    def with_target_size(self, size: float) -> CornerFactor:
-        return replace(self, bodies=replace(self.bodies, size=size))
 
     @cached_property
     def views(self) -> Views:
