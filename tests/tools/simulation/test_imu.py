@@ -60,6 +60,20 @@ def test_intrinsics_follow_the_scale_misalignment_model():
         np.testing.assert_allclose(accel, M_a @ C @ f, atol=1e-13)
 
 
+def test_a_late_accelerometer_and_a_low_pass():
+    scenario = replace(handheld(duration_s=2.0, noiseless=True), gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
+    prompt = not_none(simulate(scenario, seed=7).measurements.imu)
+    late = not_none(simulate(replace(scenario, imu_accel_delay_s=0.01), seed=7).measurements.imu)
+    np.testing.assert_array_equal(late.gyro, prompt.gyro)
+    np.testing.assert_allclose(late.accel[20:], prompt.accel[:-20], atol=1e-12)  # 20 readings of 0.5 ms
+    smooth = not_none(simulate(replace(scenario, imu_cutoff_hz=5.0), seed=7).measurements.imu)
+    sigma = np.sqrt(np.log(2.0)) / (2.0 * np.pi * 5.0) / 0.0005  # of the Gaussian, in readings
+    weights = np.exp(-0.5 * (np.arange(-400, 401) / sigma) ** 2)
+    for axis in range(3):
+        means = np.convolve(prompt.gyro[:, axis], weights / weights.sum(), "valid")
+        np.testing.assert_allclose(smooth.gyro[400:-400, axis], means, atol=1e-4)
+
+
 def test_gap_loses_readings_and_keeps_the_motion():
     scenario = handheld(duration_s=3.0)
     whole, gap = simulate(scenario, seed=8), simulate(replace(scenario, imu_gaps=((1.0, 1.5),)), seed=8)

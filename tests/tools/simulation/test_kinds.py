@@ -36,7 +36,7 @@ def test_a_kind_declares_what_its_sensors_have(kind: str):
     known = {spec.name: spec for spec in entry.parameters}
     values = sensor.true_parameters().values
     assert {name: value.shape for name, value in values.items()} == {name: (known[name].size,) for name in values}
-    assert all(hasattr(sensor, field) for field in simulated.effects.values())
+    assert all(hasattr(sensor, field) for field, _ in simulated.effects.values())
 
 
 @each("kind", SENSOR_TYPES)

@@ -74,6 +74,27 @@ def test_noise_is_along_the_beam_and_of_the_size_stated(robot, quiet):
     assert abs(along.mean()) < 4.0 * 0.03 / np.sqrt(n)
 
 
+def test_errors_of_ranges_and_elevations(robot, quiet):
+    lidar, off_deg = robot.of(SimLidar)[0], 0.1 * np.arange(8)
+    bent = replace(lidar, range_offset_m=0.03, elevation_errors_deg=tuple(off_deg))
+    sensors = tuple(bent if s is lidar else s for s in robot.sensors)
+    sim = simulate(replace(quiet.scenario, sensors=sensors), 4)
+    xyz = sim.measurements.lidars[0].xyz.astype(np.float64).reshape(-1, 180, 8, 3)
+    level, off = np.hypot(xyz[..., 0], xyz[..., 1]), np.deg2rad(off_deg)
+    true = (np.linalg.norm(xyz, axis=3) - 0.03)[..., None] * np.stack(
+        [
+            xyz[..., 0] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
+            xyz[..., 1] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
+            np.sin(np.arctan2(xyz[..., 2], level) + off),
+        ],
+        axis=3,
+    )
+    stream = replace(sim.measurements.lidars[0], xyz=true.reshape(-1, 3).astype(np.float32))
+    corrected = replace(sim, measurements=sim.measurements.with_streams(stream))
+    np.testing.assert_allclose(distance(corrected, in_world(corrected)), 0.0, atol=3e-6)
+    assert np.abs(distance(sim, in_world(sim))).max() > 0.02
+
+
 def test_points_on_hills_have_no_plane(robot):
     scenario = replace(on_ground(robot, "ramps"), features=None, robot_noise_enabled=False)
     sim = simulate(scenario, 5)

@@ -304,7 +304,10 @@ EFFECTS = """effects:
   imu: {accel_scale: [0.01, 0.02, 0.03], gyro_misalignment: [0.04, 0.05, 0.06], accel_rotation: [0.07, 0.08, 0.09]}
   pose_scale: {mocap: 0.99}
   target_size: 1.01
+  range_offset: {top: 0.02}
+  ring_elevations: {top: [0.1, 0.2, 0.3, 0.4]}
 """
+LATE = "effects: {imu: {accel_delay: 0.002, cutoff: 40}}\n"
 
 
 def test_effects_are_read(tmp_path):
@@ -313,6 +316,10 @@ def test_effects_are_read(tmp_path):
     x[[0, 2, 5, 7, 9, 10, 12, 13, 14]] = 0.01 * np.arange(1, 10)
     np.testing.assert_allclose(scenario.imu_intrinsics, x)
     assert [p.scale for p in scenario.of(SimPoses)] == [0.99] and scenario.target_size == 1.01
+    lidar = scenario.of(SimLidar)[0]
+    assert (lidar.range_offset_m, lidar.elevation_errors_deg) == (0.02, (0.1, 0.2, 0.3, 0.4))
+    late = loaded(tmp_path, LATE + FULL)
+    assert (late.imu_accel_delay_s, late.imu_cutoff_hz) == (0.002, 40.0)
 
 
 @each(
@@ -321,6 +328,8 @@ def test_effects_are_read(tmp_path):
         ("0.03]", "3]", "effects.imu.accel_scale: must be between -0.2 and 0.2: 0.01 is 1 %"),
         ("mocap: ", "mocap1: ", "effects.pose_scale.mocap1: there is no such field, did you mean 'mocap'"),
         ("1.01", "0.01", "effects.target_size: is true over stated length"),
+        ("0.02}", "2}", "effects.range_offset.top: must be between -0.5 and 0.5, but is 2."),
+        (", 0.4]", "]", "top has 4 rings, but 3 elevation errors; give one for each ring."),
     ],
 )
 def test_bad_effects_end_in_a_sentence(tmp_path, old, new, words):

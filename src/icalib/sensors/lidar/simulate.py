@@ -14,7 +14,7 @@ from icalib.base.compiled import njit
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
-from icalib.sensors.lidar.spec import RANGE_SCALE, Lidar
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE, Lidar
 from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, RoomSurfaces, nearest
@@ -28,13 +28,16 @@ from icalib.tools.simulation.scenario import (
     TrueParameters,
     at_least,
     interval,
+    limited,
     mounted_fields,
+    true_ratio,
 )
 from icalib.tools.simulation.trajectory import LEAD_S, Drive, TrueTrajectory, stamped
 
 _FIRING_S = 2.304e-6  # between the firings of two lasers of a column (Velodyne VLP-16 manual)
 _CLOUD_MESSAGE = "sensor_msgs/msg/PointCloud2"
 EXACT = Parameter("fixed", np.zeros(1))  # ranges, for the rig file
+MAX_OFFSET_M = 0.5  # of ranges; that of real LiDARs is some centimetres
 _FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
 
@@ -45,12 +48,17 @@ class SimLidar(SimSensor):
     A scan is one turn of azimuth_steps columns with `rings` points, at elevations evenly over elevation_deg. The lasers
     of a column fire 2.304 us apart, or faster if a column is shorter. The stamp of a scan is the instant of its first
     column. Points outside range_m are missing. Noise is along the beam. scale: ratio of true to reported ranges.
+    range_offset_m: reported less true ranges. elevation_errors_deg: true less reported elevation of each ring.
     """
 
     sensor_type: ClassVar[str] = "lidar"
     random_stream: ClassVar[int] = 1000
     measures: ClassVar[str] = "scans"
-    effects: ClassVar[dict[str, str]] = {"range_scale": "scale"}
+    effects: ClassVar = {
+        "range_scale": ("scale", true_ratio),
+        "range_offset": ("range_offset_m", lambda value: limited(value, MAX_OFFSET_M)),
+        "ring_elevations": ("elevation_errors_deg", lambda value: tuple(x.number() for x in value.items())),
+    }
 
     rate_hz: float = 8.0
     rings: int = 16
@@ -59,6 +67,8 @@ class SimLidar(SimSensor):
     range_m: tuple[float, float] = (0.3, 100.0)
     range_noise_m: float = 0.03
     scale: float = 1.0
+    range_offset_m: float = 0.0
+    elevation_errors_deg: tuple[float, ...] = (0.0,)
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimLidar:
@@ -76,9 +86,12 @@ class SimLidar(SimSensor):
     def check(self, room: Room | None, drive: Drive | None) -> None:
         if room is None:
             raise RigError(f"{self.name} needs a room; give the scenario one.")
+        if (n := len(self.elevation_errors_deg)) not in (1, self.rings):
+            raise RigError(f"{self.name} has {self.rings} rings, but {n} elevation errors; give one for each ring.")
 
     def true_parameters(self) -> TrueParameters:
-        return TrueParameters({RANGE_SCALE.name: np.array([1.0 / self.scale - 1.0])} if self.scale != 1.0 else {})
+        true = {RANGE_SCALE.name: 1.0 / self.scale - 1.0, RANGE_OFFSET.name: self.range_offset_m}
+        return TrueParameters({name: np.array([value]) for name, value in true.items() if value})
 
     @property
     def points(self) -> int:
@@ -156,9 +169,10 @@ class _Turn(NamedTuple):
     position: np.ndarray  # (A + 1, 3)
     beam: np.ndarray  # (A, K, 3) unit directions in the LiDAR's frame
     firing: np.ndarray  # (K,) instants as a share of a column
-    noise: np.ndarray  # (A, K) m
+    noise: np.ndarray  # (A, K) m, with the offset of ranges
     range_m: tuple[float, float]
     scale: float
+    reported: np.ndarray  # (A, K, 3) as beam, that the points of the beams have
 
 
 class _Points(NamedTuple):
@@ -178,18 +192,19 @@ def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.n
     return _Turn(
         rotation @ lidar.T_imu_sensor[:3, :3],
         position + rotation @ lidar.T_imu_sensor[:3, 3],
-        _beams(lidar),
+        _beams(lidar, np.array(lidar.elevation_errors_deg)),
         firing,
-        noise,
+        lidar.range_offset_m + noise,
         lidar.range_m,
         lidar.scale,
+        _beams(lidar),
     )
 
 
-def _beams(lidar: SimLidar) -> np.ndarray:
-    """(A, K, 3) unit directions in the LiDAR's frame."""
+def _beams(lidar: SimLidar, off_deg: np.ndarray | float = 0.0) -> np.ndarray:
+    """(A, K, 3) unit directions in the LiDAR's frame. off_deg: added to the elevation of each ring."""
     azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps
-    elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings))
+    elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings) + off_deg)
     level, up = np.cos(elevation), np.sin(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up + 0.0 * azimuth], axis=2)
 
@@ -215,9 +230,8 @@ def _fill_points(surfaces: RoomSurfaces, turn: _Turn, column_s: float, points: _
             if not (turn.range_m[0] <= distance <= turn.range_m[1]):
                 continue
             measured = distance / turn.scale + turn.noise[a, k]
-            points.xyz[count, 0] = measured * x
-            points.xyz[count, 1] = measured * y
-            points.xyz[count, 2] = measured * z
+            for i in range(3):
+                points.xyz[count, i] = measured * turn.reported[a, k, i]
             points.offset_s[count] = (a + s) * column_s
             points.plane[count] = face
             count += 1

@@ -26,6 +26,7 @@ from icalib.tools.simulation.scenario import (
     at_least,
     mounted_fields,
     pose,
+    true_ratio,
 )
 from icalib.tools.simulation.trajectory import LEAD_S, stamped
 
@@ -53,7 +54,7 @@ class SimPoses(SimSensor):
 
     sensor_type: ClassVar[str] = "pose"
     random_stream: ClassVar[int] = 4000
-    effects: ClassVar[dict[str, str]] = {"pose_scale": "scale"}
+    effects: ClassVar = {"pose_scale": ("scale", true_ratio)}
 
     rate_hz: float = 100.0
     kind: Literal["absolute", "relative"] = "absolute"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -346,20 +346,24 @@ def imu_stamps(scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
 
 def ideal_readings(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.ndarray) -> np.ndarray:
     """(N, 6) readings without errors at seconds (N,): angular rates [rad/s] and specific forces [m/s^2], sampled as
-    `Scenario.imu_sampling` says.
+    `Scenario.imu_sampling` says; the accelerometer's late by its delay.
 
     Means are those over the time since the reading before; the first one's over a period. The low-pass filter is
-    Gaussian and has no delay. Its amplitude is 1/sqrt(2) at half the rate.
+    Gaussian and has no delay. Its amplitude is 1/sqrt(2) at the cutoff, by default half the rate.
     """
-    period = 1.0 / scenario.imu_rate_hz
-    if scenario.imu_sampling == "instantaneous":
+    if delay := scenario.imu_accel_delay_s:
+        prompt = replace(scenario, imu_accel_delay_s=0.0)
+        rates, forces = (ideal_readings(prompt, trajectory, t) for t in (seconds, seconds - delay))
+        return np.concatenate([rates[:, :3], forces[:, 3:]], axis=1)
+    period, cutoff_hz = 1.0 / scenario.imu_rate_hz, scenario.imu_cutoff_hz
+    if scenario.imu_sampling == "instantaneous" and cutoff_hz is None:
         return trajectory.readings_at(seconds)
-    if scenario.imu_sampling == "interval-mean":
+    if scenario.imu_sampling == "interval-mean" and cutoff_hz is None:
         steps = np.diff(seconds, prepend=seconds[0] - period)
         nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_NODES)
         shifts = [0.5 * steps * (node - 1.0) for node in nodes]
     else:
-        sigma_s = np.sqrt(np.log(2.0)) * period / np.pi
+        sigma_s = np.sqrt(np.log(2.0)) / (2.0 * np.pi * (cutoff_hz or 0.5 / period))
         nodes, weights = np.polynomial.hermite_e.hermegauss(_QUADRATURE_NODES)
         shifts = [np.full(len(seconds), sigma_s * node) for node in nodes]
     shares = weights / weights.sum()

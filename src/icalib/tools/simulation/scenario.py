@@ -21,7 +21,7 @@ from icalib.sensors.sensor import Sensor
 from icalib.sensors.stream import Stream
 from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, Texture, dead_leaves
-from icalib.tools.simulation.trajectory import Drive, Features, TrueTrajectory
+from icalib.tools.simulation.trajectory import LEAD_S, Drive, Features, TrueTrajectory
 
 # Base class of simulated sensors other than IMU and cameras; `kinds.py` lists those of all kinds.
 
@@ -86,14 +86,14 @@ class SimSensor(ABC):
     Class variables: sensor_type, as in the rig file; random_stream, number of the first sensor's random stream, at
     least 1000 apart from those of other kinds; measures, noun for its measurements in messages; rolls, whether its
     frame is the wheel frame of motions on the ground; effects, name in the section `effects` of a scenario file -> name
-    of the field that it sets, a ratio of true to stated length.
+    of the field that it sets, and the reader of its value.
     """
 
     sensor_type: ClassVar[str]
     random_stream: ClassVar[int]
     measures: ClassVar[str] = "readings"
     rolls: ClassVar[bool] = False
-    effects: ClassVar[dict[str, str]] = {}
+    effects: ClassVar[dict[str, tuple[str, Callable[[YamlValue], Any]]]] = {}
 
     name: str
     T_imu_sensor: np.ndarray
@@ -210,37 +210,54 @@ _LARGEST = 0.2  # limit of a relative error, which no usable sensor exceeds
 def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, Any]:
     """The fields of `Scenario` that effects change, by name. value: the section; sensors: those of the scenario file.
     Raises RigError naming file, line and field."""
-    scales = {effect: (kind, field) for kind in simulated_kinds().values() for effect, field in kind.effects.items()}
-    fields, changed = value.record((), ("imu", "target_size", *scales)), {}
+    of_kinds = {effect: kind for kind in simulated_kinds().values() for effect in kind.effects}
+    fields, changed = value.record((), ("imu", "target_size", *of_kinds)), {}
     if "imu" in fields:
-        changed["imu_intrinsics"] = _intrinsics(fields["imu"])
+        changed |= _of_imu(fields["imu"])
     if "target_size" in fields:
-        changed["target_size"] = _ratio(fields["target_size"])
-    for effect in scales.keys() & fields.keys():
-        sensors = _scaled(fields[effect], sensors, *scales[effect])
+        changed["target_size"] = true_ratio(fields["target_size"])
+    for effect in of_kinds.keys() & fields.keys():
+        sensors = _with_effect(fields[effect], sensors, of_kinds[effect], effect)
         changed["sensors"] = sensors
     return changed
 
 
-def _scaled(value: YamlValue, sensors: Sequence[SimSensor], kind: type[SimSensor], field: str) -> tuple[SimSensor, ...]:
-    """The sensors, with `field` of those of `kind` set to the ratio that `value` gives for their names."""
-    ratios = value.record((), tuple(s.name for s in sensors if isinstance(s, kind)))
-    by_name = {name: _ratio(ratio) for name, ratio in ratios.items()}
+def _with_effect(
+    value: YamlValue, sensors: Sequence[SimSensor], kind: type[SimSensor], effect: str
+) -> tuple[SimSensor, ...]:
+    """The sensors, with the field of `effect` of those of `kind` set to what `value` gives for their names."""
+    field, read = kind.effects[effect]
+    given = value.record((), tuple(s.name for s in sensors if isinstance(s, kind)))
+    by_name = {name: read(number) for name, number in given.items()}
     return tuple(replace(s, **{field: by_name[s.name]}) if s.name in by_name else s for s in sensors)
 
 
-def _intrinsics(value: YamlValue) -> np.ndarray:
-    """(24,) IMU intrinsics, in the order of `Scenario.imu_intrinsics`."""
-    intrinsics = np.zeros(24)
-    for name, numbers in value.record((), tuple(_IMU)).items():
+def _of_imu(value: YamlValue) -> dict[str, Any]:
+    """The fields of `Scenario` that effects of the IMU change."""
+    fields, intrinsics = value.record((), (*_IMU, "accel_delay", "cutoff")), np.zeros(24)
+    for name, numbers in ((name, numbers) for name, numbers in fields.items() if name in _IMU):
         values = numbers.vector(len(_IMU[name]))
         if np.abs(values).max() > _LARGEST:
             numbers.fail(f"must be between {-_LARGEST} and {_LARGEST}: 0.01 is 1 %, or 10 mrad.")
         intrinsics[list(_IMU[name])] = values
-    return intrinsics
+    changed: dict[str, Any] = {"imu_intrinsics": intrinsics}
+    if "accel_delay" in fields:
+        changed["imu_accel_delay_s"] = limited(fields["accel_delay"], LEAD_S)
+    if "cutoff" in fields:
+        changed["imu_cutoff_hz"] = fields["cutoff"].positive()
+    return changed
 
 
-def _ratio(value: YamlValue) -> float:
+def limited(value: YamlValue, largest: float) -> float:
+    """A number of at most this absolute value."""
+    number = value.number()
+    if abs(number) > largest:
+        value.fail(f"must be between {-largest:g} and {largest:g}, but is {number:g}.")
+    return number
+
+
+def true_ratio(value: YamlValue) -> float:
+    """A ratio of true to stated length."""
     ratio = value.number()
     if abs(ratio - 1.0) > _LARGEST:
         value.fail(f"is true over stated length, between {1.0 - _LARGEST} and {1.0 + _LARGEST}, but is {ratio:g}.")
@@ -457,6 +474,8 @@ class Scenario:
     imu_intrinsics: np.ndarray = field(default_factory=lambda: np.zeros(24))
     imu_clock_origin_ns: int = 0
     imu_sampling: ImuSampling = "instantaneous"
+    imu_cutoff_hz: float | None = None  # of a Gaussian low-pass without delay, -3 dB; None: as imu_sampling says
+    imu_accel_delay_s: float = 0.0  # the accelerometer measures this long before the stamp of its reading
     imu_jitter_s: float = 0.0  # readings taken at instants shifted by uniform +-imu_jitter_s, below half a period
     imu_gaps: tuple[Interval, ...] = ()  # readings inside are lost
     corner_noise_enabled: bool = True  # white, blur and shift
