@@ -191,11 +191,13 @@ def _tags_on_walls(room: tuple[float, float, float], a_wall: int) -> np.ndarray:
 
 @pytest.fixture
 def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
-    """Fails where a browser finds an error in a report, or leaves one of its figures undrawn."""
+    """Fails where a browser finds an error in a page, leaves one of its figures undrawn when it is printed, or an entry
+    of its contents leads nowhere."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
         pytest.skip("no chromium is installed; install one to have the report drawn")
-    file = tmp_path / "report.html"
+    file = tmp_path / "page.html"
+    printing = "<script>dispatchEvent(new Event('beforeprint'))</script></body>"
     flags = (
         "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
         "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "
@@ -203,11 +205,14 @@ def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
     )
 
     def draw(text: str, figures: set[str]) -> None:
-        file.write_text(text, encoding="utf-8")
+        file.write_text(text.replace("</body>", printing), encoding="utf-8")
         command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", file.as_uri()]
         found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
         assert not re.findall(r"CONSOLE.*(?:Error|error).*", found.stderr)
         for name in figures:
             assert re.search(rf'<div class="plot [^"]*js-plotly-plot[^"]*" id="{name}"', found.stdout), name
+        places = re.findall('<section id="([^"]+)"', text)
+        assert re.findall('<a href="#([^"]+)"', text.split("<nav")[1].split("</nav>")[0]) == places
+        assert len(re.findall(r'<svg class="main-svg"[^>]* width="[1-9]', found.stdout)) >= len(figures)
 
     return draw

@@ -13,7 +13,7 @@ from icalib.cli import main
 from icalib.detection.images import MOST_BYTES
 from icalib.errors import CalibrationError
 from icalib.report import report_html
-from icalib.report.pictures import MOST_MARKS, NEAR_TO_FAR, figures
+from icalib.report.pictures import MOST_MARKS, NEAR_TO_FAR, Drawing, figures
 from icalib.result import Calibration
 from icalib.result.calibration import PointsInImage, ReportImage
 from icalib.result.pictures import MOST_POINTS
@@ -35,19 +35,22 @@ def with_images(c: Calibration, jpeg: bytes = JPEG, count: int = 24) -> Calibrat
     return replace(c, pictures=(corners, points))
 
 
-def paths(svg: str, css: str) -> list[str]:
-    return re.findall(rf'<path class="{css}"[^>]* d="([^"]*)"', svg)
+def paths(drawing: Drawing, css: str) -> list[str]:
+    return [line.data for line in drawing.lines if line.css == css]
+
+
+def size_of(drawing: Drawing) -> int:
+    return len(drawing.jpeg) + sum(len(line.data) for line in drawing.lines)
 
 
 def test_points_are_coloured_by_distance_and_the_outline_has_two_lines(calibration: Calibration):
-    _, (before, _), (after, words) = figures(with_images(calibration))
-    colours = re.findall(r'class="dots" stroke="(#\w+)"', after)
+    _, before, after = figures(with_images(calibration))
+    colours = [line.color for line in after.lines if line.css == "dots"]
     assert colours == [*reversed(NEAR_TO_FAR)]  # the nearest last, over the others
     assert sum(path.count("M") for path in paths(after, "dots")) == 24
     assert paths(after, "outline") == ["M10.0 10.0L90.0 10.0L10.0 90.0M300.0 200.0L310.0 200.0"]
-    assert words.startswith("As calibrated. lidar0 in cam0 <pose>.jpg, the worst of 20 images")
-    assert "base64" in before
-    assert "base64" not in after
+    assert after.words.startswith("As calibrated. lidar0 in cam0 <pose>.jpg, the worst of 20 images")
+    assert before.jpeg and not after.jpeg and before.image == after.image == "shot-1"
 
 
 def test_lines_lead_to_where_a_point_is_projected(calibration: Calibration):
@@ -57,14 +60,14 @@ def test_lines_lead_to_where_a_point_is_projected(calibration: Calibration):
     rejected = np.zeros(len(r.uv), bool)
     rejected[r.start[70]] = True
     ones = replace(r, residual=np.tile([1.0, 0.0], (len(r.uv), 1)), rejected=rejected)
-    svg, words = next(iter(figures(replace(c, residuals=c.residuals | {("cam0", "corners"): ones}))))
+    drawing = next(iter(figures(replace(c, residuals=c.residuals | {("cam0", "corners"): ones}))))
     count = int(np.diff(r.start)[70])
-    lines = re.findall(r"M([\d.]+) ([\d.]+)l([-\d.]+) ([-\d.]+)", "".join(paths(svg, "residual")))
+    lines = re.findall(r"M([\d.]+) ([\d.]+)l([-\d.]+) ([-\d.]+)", "".join(paths(drawing, "residual")))
     assert len(lines) == count <= MOST_MARKS
     assert {(float(du), float(dv)) for _, _, du, dv in lines} == {(20.0, 0.0)}
     np.testing.assert_allclose([float(u) for u, *_ in lines], r.uv[r.start[70] : r.start[71], 0], atol=0.051)
-    assert paths(svg, "rejected")[0].count("M") == 1
-    assert f"{count - 1} corners, 1 rejected; residuals are 20 times as long" in words
+    assert paths(drawing, "rejected")[0].count("M") == 1
+    assert f"{count - 1} corners, 1 rejected; residuals are 20 times as long" in drawing.words
 
 
 def test_the_page_holds_its_images(calibration: Calibration):
@@ -80,8 +83,8 @@ def test_pictures_have_a_bounded_size(calibration: Calibration):
     noise = np.random.default_rng(0).bytes(MOST_BYTES)
     corners, *points = figures(with_images(calibration, noise, MOST_POINTS))
     in_page = 4 / 3 * MOST_BYTES + 2_000
-    assert len(corners[0]) < in_page + 100 * MOST_MARKS
-    assert sum(len(svg) for svg, _ in points) < in_page + MOST_OF_POINTS + 4_000
+    assert size_of(corners) < in_page + 100 * MOST_MARKS
+    assert sum(map(size_of, points)) < in_page + MOST_OF_POINTS + 4_000
 
 
 @pytest.mark.parametrize(("option", "wanted"), [([], True), (["--no-images"], False)])

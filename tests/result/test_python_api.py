@@ -55,7 +55,7 @@ class Cells(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        self.texts.append(data)
+        self.texts += [data] if data.strip() else []
 
 
 def test_notebooks_show_the_same_as_html(robot: Calibration):

@@ -138,7 +138,7 @@ def test_report_has_its_figures(either: Calibration):
 
 def test_report_says_it_in_words(robot: Calibration, without_cameras: Calibration):
     words = words_of(report_html(robot))
-    for part in ("lidar0 lidar determined", "wheel0 wheels determined", "± 0.12 mmdetermined"):
+    for part in ("lidar0 lidar determined", "wheel0 wheels determined", "radius rightdetermined102.00± 0.12 mm"):
         assert part in words, part
     (r,) = robot.lidar_residuals
     first, now = (1e3 * np.sqrt(np.mean(x.astype(float) ** 2)) for x in (r.first_residual, r.residual))

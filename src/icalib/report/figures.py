@@ -95,10 +95,12 @@ def thin(count: int, most: int) -> np.ndarray:
     return np.arange(count) if count <= most else np.linspace(0, count - 1, most).astype(np.int64)
 
 
-# Figure of `RowResiduals` over time.
+# Panels over time.
 
 MOST_ROWS = 2500  # rows in one figure; more are thinned out
 DISPLAY_UNITS = {"rad": ("mrad", 1e3), "m": ("mm", 1e3), "m/s": ("mm/s", 1e3)}
+SHOWN_PERCENTILES = (1.0, 99.0)  # of the values in a panel, which one of them far away must not flatten
+ROOM = 0.5  # on either side of them, as a share of their span: normal noise is cut beyond 4.7 standard deviations
 
 
 def panels(r: RowResiduals) -> Figure:
@@ -106,19 +108,50 @@ def panels(r: RowResiduals) -> Figure:
     and mm."""
     keep = thin(len(r.seconds), MOST_ROWS)
     units = [DISPLAY_UNITS.get(unit, (unit, 1.0)) for unit in r.units]
-    traces = [
-        line(
-            r.seconds[keep],
-            scale * r.residual[keep, k],
-            label,
-            COLORS[k % len(COLORS)],
-            yaxis=y_of(k),
-            line={"color": COLORS[k % len(COLORS)], "width": 1},
-        )
-        for k, (label, (_, scale)) in enumerate(zip(r.labels, units, strict=True))
-    ]
-    titles = [f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, units, strict=True)]
-    return figure(traces, 130 * len(titles) + 90, **stacked_axes(titles))
+    columns = [(r.seconds[keep], scale * r.residual[keep, k : k + 1]) for k, (_, scale) in enumerate(units)]
+    titles = tuple(f"{label} [{unit}]" for label, (unit, _) in zip(r.labels, units, strict=True))
+    return stacked_panels(columns, titles, 130 * len(titles) + 90, ("",), COLORS)
+
+
+def stacked_panels(
+    panels: list[tuple[np.ndarray, np.ndarray]],
+    titles: tuple[str, ...],
+    height: int,
+    names: tuple[str, ...] = ("x", "y", "z"),
+    colors: tuple[str, ...] = AXIS_COLORS,
+) -> Figure:
+    """Stacked panels with a line for each of `names`. panels: times (n,) and values (n, m) of each; height [px].
+    Triangles at the edge of a panel mark values beyond it, see `shown_range`."""
+    layout, traces, cut = stacked_axes(list(titles)), list[dict[str, Any]](), list[dict[str, Any]]()
+    for p, (t, v) in enumerate(panels):
+        low, high = shown_range(v)
+        layout[y_of(p).replace("y", "yaxis")]["range"] = numbers(np.array([low, high]))
+        for i, name in enumerate(names):
+            style = {"line": {"color": colors[i], "width": 1}, "showlegend": p == 0 and name != ""}
+            traces.append(line(t, v[:, i], name, colors[i], yaxis=y_of(p), **style))
+            out = (v[:, i] < low) | (v[:, i] > high)
+            cut += [cut_marks(t[out], v[out, i], low, high, yaxis=y_of(p), showlegend=not cut)] if out.any() else []
+    return figure(traces + cut, height, **layout)
+
+
+def shown_range(values: np.ndarray) -> tuple[float, float]:
+    """Ends of an axis: SHOWN_PERCENTILES of `values` and ROOM about them, or their extent where that is less."""
+    finite = values[np.isfinite(values)]
+    if not len(finite):
+        return -1.0, 1.0
+    low, high = np.percentile(finite, SHOWN_PERCENTILES)
+    low, high = max(finite.min(), low - ROOM * (high - low)), min(finite.max(), high + ROOM * (high - low))
+    edge = 0.05 * (high - low) or 0.5 * abs(high) or 1.0
+    return float(low - edge), float(high + edge)
+
+
+def cut_marks(x: np.ndarray, y: np.ndarray, low: float, high: float, **more: Any) -> dict[str, Any]:
+    """Trace of triangles at the edges of the axis from `low` to `high`, for values y beyond it."""
+    keep = thin(len(x), MOST_ROWS)
+    symbols = np.where(y[keep] > high, "triangle-up", "triangle-down").tolist()
+    marker = {"color": REJECTED, "size": 6, "symbol": symbols}
+    named = {"text": [f"{value:.3g}" for value in y[keep].tolist()], "hovertemplate": "%{text}<extra></extra>"}
+    return dots(x[keep], np.clip(y[keep], low, high), "beyond the frame", "", marker=marker, **named, **more)
 
 
 # Histogram of the normalised residuals of all sensors.

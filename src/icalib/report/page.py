@@ -1,17 +1,19 @@
-"""The report as one HTML file, and the sections, cards and tables of which it is made."""
+"""The report as one HTML file: what its template shows, and the plots, sections and cards of which it is made."""
 
 from __future__ import annotations
 
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
-from html import escape
+from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import files
-from string import Template
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
 
 from icalib.detection.images import MOST_PICTURES
 from icalib.kinds import presenters
@@ -69,10 +71,91 @@ from icalib.result.verdict import (
     tolerance,
     worst,
 )
+from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.sensors.stream import Residuals
 
-# `report.html`: one HTML file that needs no network. The verdict comes first, the supporting figures and tables after
-# it.
+# A page is one HTML file that needs no network, from a Jinja template that extends report/frame.html.
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure of a page. name: id of its HTML element; wide: over all columns."""
+
+    name: str
+    figure: Figure
+    title: str
+    words: str = ""
+    wide: bool = False
+
+    @property
+    def picture(self) -> pictures.Drawing | None:
+        """What is printed in place of a 3D figure; None for others, which are printed as they are."""
+        return pictures.static_picture(self.figure)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Plots under one heading. note: small, beside the heading; words: below it."""
+
+    title: str = ""
+    plots: Sequence[Plot] = ()
+    note: str = ""
+    words: str = ""
+
+
+@dataclass(frozen=True)
+class Section:
+    """One section of a page. name: its HTML id; words: introductory paragraph."""
+
+    name: str
+    title: str
+    words: str
+    groups: Sequence[Group]
+
+    @property
+    def plots(self) -> list[Plot]:
+        """The plots of all groups."""
+        return [plot for group in self.groups for plot in group.plots]
+
+
+_CONTENTS = re.compile(r'<section id="([^"]+)"[^>]*>\s*<h2>(.*?)</h2>')
+
+
+@cache
+def _templates() -> Environment:
+    loader = PackageLoader("icalib", ".")
+    env = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
+    env.filters["contents"] = lambda body: [(name, Markup(title)) for name, title in _CONTENTS.findall(body)]
+    return env
+
+
+def document(template: str, plots: Iterable[Plot], **values: object) -> str:
+    """One HTML file, plotly.js included, from a template of the package, such as "report/page.html". plots: those that
+    it shows; values: what else it names. Text is escaped."""
+    return (
+        _templates()
+        .get_template(template)
+        .render(
+            figures=script_json({plot.name: plot.figure for plot in plots}),
+            css=Markup(resource("icalib.report", "page.css")),
+            plotly=Markup(resource("plotly", "package_data/plotly.min.js")),
+            **values,
+        )
+    )
+
+
+def script_json(figures: dict[str, Figure]) -> Markup:
+    """Figures as JSON for a script element. `<` is escaped, so that no sensor name can close the element."""
+    text = json.dumps(figures, separators=(",", ":"), allow_nan=False)
+    return Markup(text.replace("<", "\\u003c"))
+
+
+def resource(package: str, name: str) -> str:
+    """Text of a resource file of a Python package."""
+    return files(package).joinpath(name).read_text(encoding="utf-8")
+
+
+# `report.html`: the verdict comes first, the supporting figures and tables after it.
 
 _NO_CROSS_VALIDATION = (
     "No cross-validation: the recording is too short for segments, or segments are off in the rig file, or its halves "
@@ -91,53 +174,77 @@ _POINTS_WORDS = (
     "calibration colours change at the edges of objects. A wrong rotation shifts points in all images, a wrong time "
     "offset in those of fast turns. Points that an object hides from the camera are drawn, too."
 )
+_HISTOGRAM_WORDS = (
+    "The distribution is a little narrower than normal where estimated parameters absorb part of the noise, most of "
+    "all for points in few images."
+)
+_CONVERGENCE_WORDS = "Each stage of the solver has its colour. The predicted decrease says how far it has to go."
+_CORRELATION_WORDS = "Formal. Pairs near 1 or -1 cannot be told apart well by this motion."
+_SHIFT_WORDS = "Each dot is the change of a parameter if one part of the recording is left out."
 
 
 def report_html(calibration: Calibration) -> str:
     """The whole report as one HTML document, plotly.js included."""
     c = calibration
-    about_sensors = sections(c)
-    words = {
-        "sensors": " + ".join((*(() if c.imu is None else (c.imu,)), *c.mounted)),
-        "size": size_words(c),
-        "body": body_name(c),
-        "reference": reference_name(c),
-        "status": c.status,
-        "answer": f"{c.verdict[0].upper()}{c.verdict[1:]}. {NEXT[c.verdict]}",
-        "ellipsoids": _ellipsoid_words(c),
-        "legend": "".join(f"; {legend}" for legend in rig_figures.legends(c)),
-        "most_keyframes": rig_figures.MAX_PLOTTED_KEYFRAMES,
-    }
-    parts = {
-        "trust": trust(c),
-        "cards": sensor_cards(c),
-        "pairs": camera_pairs(c),
-        "pictures": _pictures(c),
-        "reasons": reasons(c),
-        "notes": sentences(c.notes, "", "None."),
-        "fits": fits(c),
-        "parameters": parameters(c),
-        "poses": Html(poses(c) + relative(c) + bodies(c)),
-        "cross_validation": _cross_validation_section(c),
-        "sensor_sections": Html("\n".join(section.html for section in about_sensors)),
-        "facts": facts(c),
-        "without_imu": "" if c.imu else " hidden",
-    }
-    escaped = {name: html(value) for name, value in words.items()}
-    body = Template(resource("icalib.report", "page.html")).substitute(escaped | parts)
-    figures = {name: drawn for section in about_sensors for name, drawn in section.figures.items()}
-    return document(f"Calibration of {words['sensors']}", body, _figures(c) | figures)
+    about_sensors, drawn, general = sections(c), list(pictures.figures(c)), _plots(c)
+    return document(
+        "report/page.html",
+        [*general.values(), *(plot for section in about_sensors for plot in section.plots)],
+        c=c,
+        title=f"Calibration of {' + '.join((*(() if c.imu is None else (c.imu,)), *c.mounted))}",
+        header=_header(c),
+        body=body_name(c),
+        reference=reference_name(c),
+        answer=f"{c.verdict[0].upper()}{c.verdict[1:]}. {NEXT[c.verdict]}",
+        trust=TRUST[c.verdict],
+        grave={c.failure, *c.wrong, *c.unobservable},
+        extrinsics=extrinsics(c),
+        lead=replace(drawn[-1], jpeg="") if drawn else general["rig"].picture,
+        cards=sensor_cards(c),
+        pairs=camera_pairs(c),
+        drawings=drawn,
+        picture_words=_picture_words(c),
+        general=general,
+        fits=[(f.sensor, f.kind, f.count, dof_words(f), chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits],
+        sections=about_sensors,
+        held=c.cross_validation and words(c, c.cross_validation),
+        predicted=predicted_fits(c.cross_validation),
+        no_cross_validation=_NO_CROSS_VALIDATION,
+        parameters=[(r.sensor, r.name, r.verdict, r.value, r.std, r.unit, r.formal, r.factor) for r in table_rows(c)],
+        bodies=[(name, *_body_row(c, name)) for name in c.bodies],
+        matrices={f"T_{c.body}_{name}": _matrix_text(c.T_body_sensor(name)) for name in _posed(c)},
+        relative=[_relative_row(r) for r in relative_poses(c)],
+        relative_matrices={r.name: _matrix_text(r.T) for r in relative_poses(c)},
+        near_lock=NEAR_LOCK,
+        facts=facts(c),
+    )
 
 
-def _pictures(c: Calibration) -> Html:
-    """Section with recorded images and what was found in them; empty without images."""
-    shots = [element("figure", [Html(svg), element("figcaption", text)]) for svg, text in pictures.figures(c)]
-    if not shots:
-        return Html("")
+def summary_html(c: Calibration) -> str:
+    """The verdict with its reasons, and a table of all parameters, as HTML for a notebook."""
+    return _templates().get_template("report/summary.html").render(c=c, rows=table_rows(c))
+
+
+TRUST: dict[Usability, str] = {
+    "usable": "good",
+    "usable with care": "care",
+    "partly usable": "bad",
+    "not usable": "wrong",
+}
+
+
+def _header(c: Calibration) -> dict[str, str]:
+    """What the page is about: recordings, rig file, date, version, amount of data. Unknown entries are empty."""
+    rig = next((Path(name).name for name in c.inputs if Path(name).suffix in (".yaml", ".yml")), "")
+    recordings = ", ".join(r.name for r in c.recordings)
+    made = c.made[:16].replace("T", " ")
+    known = {"Recording": recordings, "Rig file": rig, "Date": made and f"{made} UTC"}
+    return known | {"icalib": c.versions.get("icalib", ""), "Data": size_words(c)}
+
+
+def _picture_words(c: Calibration) -> str:
     has_points = any(picture.after is not None for picture in c.pictures)
-    text = f"{_PICTURE_WORDS} {_POINTS_WORDS if has_points else ''}".rstrip()
-    parts = [element("h2", "What the sensors saw"), element("p", text), element("div", shots, "shots")]
-    return Html(f'<section id="pictures">{html(parts)}</section>')
+    return f"{_PICTURE_WORDS} {_POINTS_WORDS if has_points else ''}".rstrip()
 
 
 def _ellipsoid_words(c: Calibration) -> str:
@@ -150,78 +257,27 @@ def _ellipsoid_words(c: Calibration) -> str:
     )
 
 
-def document(title: str, body: str, figures: dict[str, Figure]) -> str:
-    """One HTML file, plotly.js included. Each of `figures` is drawn in the element of `body` whose id is its key."""
-    return Template(resource("icalib.report", "frame.html")).substitute(
-        title=html(title),
-        body=body,
-        figures=script_json(figures),
-        css=resource("icalib.report", "page.css"),
-        plotly=resource("plotly", "package_data/plotly.min.js"),
-    )
-
-
-def _figures(c: Calibration) -> dict[str, Figure]:
-    """Figures that are not about one kind of sensor, by the id of their HTML element."""
-    figures = {
-        "rig": rig_figures.rig_picture(c),
-        "histogram": normalised_histogram(c),
-        "trajectory": rig_figures.trajectory(c),
-        "motion": rig_figures.motion(c),
-        "convergence": rig_figures.convergence(c),
-        "correlation": rig_figures.correlation(c),
-    }
-    if c.imu is None:
-        del figures["motion"]
-    if c.cross_validation is not None:
-        figures["held-out"] = jackknife_shifts(c, c.cross_validation)
-    return figures
-
-
-def _cross_validation_section(c: Calibration) -> Html:
-    """Sentences, table and place for the figure of the cross-validation."""
-    cross_validation = c.cross_validation
-    if cross_validation is None:
-        return element("p", _NO_CROSS_VALIDATION, "quiet")
-    rise, verdict, parts = words(c, cross_validation)
-    paragraphs = [
-        element("p", verdict, "answer"),
-        element("p", f"{rise} {parts}"),
-        predicted_fits(cross_validation),
+def _plots(c: Calibration) -> dict[str, Plot]:
+    """Plots that are not about one kind of sensor, by name."""
+    rig = f"In the frame of {reference_name(c)}. Red, green and blue are x, y and z"
+    rig += "".join(f"; {legend}" for legend in rig_figures.legends(c))
+    few = f"At most {rig_figures.MAX_PLOTTED_KEYFRAMES} keyframes are drawn."
+    plots = [
+        Plot("rig", rig_figures.rig_picture(c), "Places of the sensors", f"{rig}.{_ellipsoid_words(c)}"),
+        Plot("histogram", normalised_histogram(c), "Normalised residuals", _HISTOGRAM_WORDS),
+        Plot("trajectory", rig_figures.trajectory(c), "Trajectory", f"The path of {c.reference} in the world. {few}"),
+        Plot("convergence", rig_figures.convergence(c), "Cost at each step", _CONVERGENCE_WORDS),
+        Plot("correlation", rig_figures.correlation(c), "Correlation coefficients", _CORRELATION_WORDS),
     ]
-    return Html("".join((*paragraphs, element("h3", "Parameters without each part"), plot_place("held-out"))))
-
-
-def script_json(figures: dict[str, Figure]) -> str:
-    """Figures as JSON for a script element. `<` is escaped, so that no sensor name can close the element."""
-    text = json.dumps(figures, separators=(",", ":"), allow_nan=False)
-    return text.replace("<", "\\u003c")
-
-
-def resource(package: str, name: str) -> str:
-    """Text of a resource file of a Python package."""
-    return files(package).joinpath(name).read_text(encoding="utf-8")
+    if c.imu is not None:
+        plots.append(Plot("motion", rig_figures.motion(c), "Angular rate, velocity and biases over time", few))
+    if c.cross_validation is not None:
+        shifts = jackknife_shifts(c, c.cross_validation)
+        plots.append(Plot("held-out", shifts, "Parameters without each part", _SHIFT_WORDS))
+    return {plot.name: plot for plot in plots}
 
 
 # Sections of the report, each about the residuals of one kind of sensor.
-
-
-@dataclass(frozen=True)
-class Section:
-    """One section of the report. name: its HTML id; words: introductory paragraph; body: HTML that contains an element
-    for each of `figures`, whose id is the key of the figure."""
-
-    name: str
-    title: str
-    words: str
-    body: Html
-    figures: dict[str, Figure] = field(default_factory=dict)
-
-    @property
-    def html(self) -> Html:
-        """The section as an HTML element."""
-        content = [element("h2", self.title), element("p", self.words), self.body]
-        return Html(f'<section id="{html(self.name)}">{html(content)}</section>')
 
 
 def sections(c: Calibration) -> list[Section]:
@@ -235,42 +291,67 @@ def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -
     HTML id; words: added to the introduction."""
     residuals = [r for r in c.residuals.values() if isinstance(r, RowResiduals) and r.sensor in c.of_type(kind)]
     if residuals:
-        figures = {f"{name}-{i}": panels(r) for i, r in enumerate(residuals)}
-        parts = [element("h3", r.sensor) + plot_place(place) for place, r in zip(figures, residuals, strict=True)]
-        yield Section(name, title, f"Predicted - measured. {words}".strip(), Html("".join(parts)), figures)
+        plots = [Plot(f"{name}-{i}", panels(r), f"{r.sensor}: residuals over time") for i, r in enumerate(residuals)]
+        yield Section(name, title, f"Predicted - measured. {words}".strip(), [Group(plots=plots)])
 
 
-def plot_place(name: str, css: str = "") -> Html:
-    """HTML element in which the figure `name` is drawn."""
-    return Html(f'<div class="plot {css}" id="{html(name)}"></div>')
+# Extrinsics on the first screen.
+
+
+def extrinsics(c: Calibration) -> list[tuple[str, Verdict, str, str, str]]:
+    """A row for each sensor with a place: name, verdict, and values with standard deviations of translation, rotation
+    and time offset, as text."""
+    out, entries = [], rows(c)
+    for name in dict.fromkeys(r.sensor for r in entries if r.sensor in c.mounted or r.sensor == c.imu):
+        groups = [g for g in in_body_frame(c).groups if g.sensor == name and g.name in MOUNTED_NAMES]
+        verdict = worst(tuple(v for g in groups for v in counted(c, g)))
+        cells = (_cell([r for r in entries if (r.sensor, r.group) == (name, g)]) for g in MOUNTED_NAMES)
+        by_name = dict(zip(MOUNTED_NAMES, cells, strict=True))
+        if any(by_name.values()):
+            out.append((name, verdict, by_name["translation"], by_name["rotation"], by_name["time_offset"]))
+    return out
+
+
+def _cell(entries: list[Row]) -> str:
+    return ", ".join(f"{r.value} ± {r.std}" if r.std else r.value for r in entries if r.value)
 
 
 # One card for each sensor: value, standard deviation and verdict of every component, and its goodness of fit.
 
 
-def sensor_cards(c: Calibration) -> Html:
+@dataclass(frozen=True)
+class Card:
+    """What is known of one sensor. css: its colour; marks: further labels; components: rows of name, verdict, value
+    and standard deviation; fits: sentences on residuals, and whether each is larger than the stated noise predicts."""
+
+    sensor: str
+    kind: str
+    css: str
+    verdict: Verdict
+    marks: list[str]
+    components: list[tuple[str, str, str, str]]
+    fits: list[tuple[str, bool]]
+
+
+def sensor_cards(c: Calibration) -> list[Card]:
     """Cards of all sensors with parameters or residuals, in the order of the rig file; the IMU comes last."""
     known = {g.sensor for g in nontrivial_groups(in_body_frame(c))} | {f.sensor for f in c.fits}
     names = sorted((n for n in c.rig["sensors"] if n in known), key=lambda n: n == c.imu)
-    return Html("".join(_card(c, name) for name in names))
+    return [_card(c, name) for name in names]
 
 
-def camera_pairs(c: Calibration) -> Html:
-    """Table of camera pairs: baseline, and standard deviation of the relative rotation. Empty for fewer than two
-    cameras."""
-    pairs = [r for r in relative_poses(c) if {r.frame, r.sensor} <= c.lenses.keys()]
-    if not pairs:
-        return Html("")
-    body = [
+def camera_pairs(c: Calibration) -> list[tuple[str, Verdict, str, str]]:
+    """Rows of camera pairs: verdict, baseline, standard deviation of the relative rotation."""
+    return [
         (
             f"{r.frame} to {r.sensor}",
+            _pair_verdict(c, r),
             f"{1e3 * r.distance:.2f} ± {format_number(1e3 * r.distance_std)} mm",
             f"± {format_number(float(np.rad2deg(r.std[:3].max())))} deg",
-            badge(_pair_verdict(c, r)),
         )
-        for r in pairs
+        for r in relative_poses(c)
+        if {r.frame, r.sensor} <= c.lenses.keys()
     ]
-    return table(("camera pair", "baseline", "rotation", "verdict"), body)
 
 
 def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
@@ -279,7 +360,7 @@ def _pair_verdict(c: Calibration, r: RelativePose) -> Verdict:
     return component_verdict(float(max(r.std[:3].max() / turn, r.std[3:].max() / move)))
 
 
-def _card(c: Calibration, sensor: str) -> Html:
+def _card(c: Calibration, sensor: str) -> Card:
     """Card of one sensor. Red: a component is unusable, residuals are at least `FAR_BEYOND` times the stated noise,
     or an error in the rig file or recording names the sensor. Amber: a component is weak, or residuals exceed the
     stated noise."""
@@ -291,26 +372,21 @@ def _card(c: Calibration, sensor: str) -> Html:
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
     css = "bad" if verdict in UNUSABLE or named or fit >= FAR_BEYOND else "weak" if fit > 1.0 else verdict
     marks = [w for w, applies in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if applies]
-    badges = [element("span", mark, f"badge {css}") for mark in marks]
-    kind = c.rig["sensors"][sensor]["type"]
-    head = element("h3", [html(sensor), element("small", f" {kind} "), badge(verdict), *badges])
-    lines = [element("li", _fit_words(f), "poor" if excess(f) > 1.0 else "") for f in fits]
-    fit_lists = [element("ul", lines)] if lines else []
-    table = [_components(c, sensor, lens)] if groups else []
-    return element("article", [head, *table, *fit_lists], f"card {css}")
+    components = _components(c, sensor, lens) if groups else []
+    lines = [(_fit_words(f), excess(f) > 1.0) for f in fits]
+    return Card(sensor, c.rig["sensors"][sensor]["type"], css, verdict, marks, components, lines)
 
 
-def _components(c: Calibration, sensor: str, lens: tuple[str, ...]) -> Html:
-    """Table with one row for each component. The coefficients of a lens share one row, which shows its projection
-    uncertainty."""
+def _components(c: Calibration, sensor: str, lens: tuple[str, ...]) -> list[tuple[str, str, str, str]]:
+    """One row for each component. The coefficients of a lens share one row, which shows its projection uncertainty."""
     hidden = {*AUXILIARY, *(n for g in c.groups if g.sensor == sensor and g.name in lens for n in g.labels)}
     components = [r for r in rows(c) if r.sensor == sensor and r.name not in hidden]
-    body = [(r.name, r.value, _std(r), badge(r.verdict)) for r in components]
+    body = [(r.name, r.verdict, r.value, _std(r)) for r in components]
     if lens:
         sigma, verdict = lens_projection_px(c, sensor), lens_verdict(c, sensor)
         size = "" if sigma is None else f"± {format_number(sigma)} px"
-        body.append(("lens, projection" if size else "lens", "", size, badge(verdict)))
-    return table(("", "value", "std", ""), body, ("value", "std"))
+        body.append(("lens, projection" if size else "lens", verdict, "", size))
+    return body
 
 
 def _std(row: Row) -> str:
@@ -324,151 +400,45 @@ def _fit_words(f: SensorFit) -> str:
     return f"{f.kind}: {rms}chi^2 / dof {chi2_words(f)}"
 
 
-# Texts and tables of the report as HTML. Only this module escapes text.
-
-TRUST: dict[Usability, str] = {
-    "usable": "good",
-    "usable with care": "care",
-    "partly usable": "bad",
-    "not usable": "wrong",
-}
+# Tables below the first screen.
 
 
-class Html(str):
-    """Text that is already HTML, so that `html` does not escape it."""
-
-
-def element(tag: str, content: object, css: str = "") -> Html:
-    """<tag class=css>content</tag>; content is escaped unless it is Html."""
-    attribute = f' class="{escape(css)}"' if css else ""
-    return Html(f"<{tag}{attribute}>{html(content)}</{tag}>")
-
-
-def html(content: object) -> Html:
-    """`content` as HTML: unchanged if it is Html, its items joined if it is a list, otherwise escaped text."""
-    if isinstance(content, Html):
-        return content
-    if isinstance(content, list):
-        return Html("".join(html(part) for part in content))
-    return Html(escape(str(content)))
-
-
-def table(headers: Sequence[str], body: Iterable[Sequence[object]], numeric: Sequence[str] = ()) -> Html:
-    """HTML table; columns named in `numeric` are right-aligned."""
-    css = ["number" if h in numeric else "" for h in headers]
-    head = element("tr", [element("th", h, c) for h, c in zip(headers, css, strict=True)])
-    lines = [element("tr", [element("td", x, c) for x, c in zip(row, css, strict=True)]) for row in body]
-    return element("div", element("table", [element("thead", head), element("tbody", lines)]), "scroll")
-
-
-def sentences(items: Sequence[str], css: str, nothing: str) -> Html:
-    """HTML list of sentences, or the paragraph `nothing` if there are none. css: class of the list."""
-    if not items:
-        return element("p", nothing, "quiet")
-    return element("ul", [element("li", item) for item in items], css)
-
-
-def reasons(c: Calibration) -> Html:
-    """Numbered list of why the verdict is not `usable`, the most important reason first."""
-    if not c.reasons:
-        return element("p", "None: every check passed.", "quiet")
-    grave = {c.failure, *c.wrong, *c.unobservable}
-    items = [element("li", sentence, "bad" if sentence in grave else "care") for sentence in c.reasons]
-    return element("ol", items, "reasons")
-
-
-def badge(verdict: str) -> Html:
-    """Coloured label of a verdict; empty without one."""
-    return Html("") if not verdict else element("span", verdict, f"badge {'bad' if verdict in UNUSABLE else verdict}")
-
-
-def trust(c: Calibration) -> str:
-    """CSS class, in page.css, of the verdict on the result."""
-    return TRUST[c.verdict]
-
-
-def parameters(c: Calibration) -> Html:
-    """Table of all parameters except poses of the target's rigid bodies; sensors come first."""
-    headers = ("sensor", "parameter", "value", "std", "unit", "formal std", "factor", "verdict")
-    body = [(r.sensor, r.name, r.value, r.std, r.unit, r.formal, r.factor, badge(r.verdict)) for r in table_rows(c)]
-    return table(headers, body, ("value", "std", "formal std", "factor"))
-
-
-def bodies(c: Calibration) -> Html:
-    """Table of the poses of the target's rigid bodies; empty for a single body."""
-    if not c.bodies:
-        return Html("")
-    sizes = ("x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "std [mm]", "std [deg]")
-    body = [(name, *_body_row(c, name)) for name in c.bodies]
-    title = element("h3", f"Target: bodies in the frame of {c.bodies[0]}, standard deviations the largest of three")
-    return Html(title + table(("body", *sizes, "verdict"), body, sizes))
-
-
-def _body_row(c: Calibration, body: str) -> list[object]:
+def _body_row(c: Calibration, body: str) -> list[str]:
     turn, move = c.group(body, "rotation"), c.group(body, "translation")
     angles, angle_std = rpy_deg(turn.value, joint_covariance(c, [turn]))
     values = [f"{1e3 * x:.2f}" for x in move.value] + [f"{x:.3f}" for x in angles]
     if turn.columns is None:
-        return [*values, "", "", badge("fixed")]
+        return [*values, "", "", "fixed"]
     std = [format_number(1e3 * float(move.std.max())), format_number(float(angle_std.max()))]
-    return [*values, *std, badge(worst((*turn.verdict, *move.verdict)))]
+    return [*values, *std, worst((*turn.verdict, *move.verdict))]
 
 
-def poses(c: Calibration) -> Html:
-    """T_body_sensor of each sensor as a 4x4 matrix, as text to copy."""
-    names = c.mounted if c.body == c.reference else c.on_body
-    return element("div", [_matrix(f"T_{c.body}_{name}", c.T_body_sensor(name)) for name in names], "matrices")
+def _posed(c: Calibration) -> tuple[str, ...]:
+    """Names of the sensors whose pose in the body frame is shown as a matrix."""
+    return c.mounted if c.body == c.reference else c.on_body
 
 
-def _matrix(name: str, T: np.ndarray) -> Html:
-    lines = "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in T)
-    return element("figure", [element("figcaption", name), element("pre", lines)])
+def _matrix_text(T: np.ndarray) -> str:
+    return "\n".join("[" + ", ".join(f"{x: .9f}" for x in row) + "]" for row in T)
 
 
-def relative(c: Calibration) -> Html:
-    """Table and matrices of the relative poses of all pairs in `relative_poses`; empty if there are none."""
-    pairs = relative_poses(c)
-    if not pairs:
-        return Html("")
-    title = element("h3", "One sensor seen from another")
-    words = element(
-        "p",
-        "Standard deviations come from the joint covariance of both sensors, empirical factors included. All of it is "
-        "in calibration.yaml. T_a_b takes coordinates in the frame of b to that of a. Position: std along the axes "
-        f"of a. {NEAR_LOCK} An unobservable component has the uncertainty of its initial guess.",
-    )
-    headers = ("", "distance [mm]", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
-    body = []
-    for r in pairs:
-        angles, angle_std = rpy_deg(r.T[:3, :3], r.covariance[:3, :3])
-        values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *angles]
-        std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *angle_std]
-        body.append((r.name, *(f"{x:.3f} ± {format_number(s)}" for x, s in zip(values, std, strict=True))))
-    matrices = element("div", [_matrix(r.name, r.T) for r in pairs], "matrices")
-    return Html(title + words + table(headers, body, headers[1:]) + matrices)
+def _relative_row(r: RelativePose) -> list[str]:
+    """Name, distance, translation [mm] and rotation [deg] of a relative pose, with standard deviations."""
+    angles, angle_std = rpy_deg(r.T[:3, :3], r.covariance[:3, :3])
+    values = [1e3 * r.distance, *(1e3 * r.T[:3, 3]), *angles]
+    std = [1e3 * r.distance_std, *(1e3 * r.std[3:]), *angle_std]
+    return [r.name, *(f"{x:.3f} ± {format_number(s)}" for x, s in zip(values, std, strict=True))]
 
 
-def fits(c: Calibration) -> Html:
-    """Table of the goodness of fit of each kind of measurement."""
-    headers = ("sensor", "kind", "residuals", "post-fit dof", "chi2 / dof", "RMS", "rejected")
-    body = [(f.sensor, f.kind, f.count, dof_words(f), chi2_words(f), rms_words(f), f.rejected or "") for f in c.fits]
-    return table(headers, body, headers[2:])
-
-
-def facts(c: Calibration) -> Html:
-    """Tables of settings, effects that were tested, versions, wall times, sensor rates and input files."""
-    names = ("setting", "value")
-    parts: list[object] = []
-    for title, values in (
-        ("Settings", c.settings),
-        ("Tested, not in the model", {name: _tested_words(effect) for name, effect in c.effects.items()}),
-        ("Versions", c.versions),
-        ("Wall time [s]", {k: f"{v:.2f}" for k, v in c.timings.items()}),
-        ("Rates [Hz]", {k: f"{v:.4g}" for k, v in c.rates.items()}),
-    ):
-        parts.append(element("section", [element("h3", title), table(names, values.items())]))
-    files = table(("file", "sha256"), [(name, element("code", digest)) for name, digest in c.inputs.items()])
-    return Html(element("div", parts, "grid") + element("h3", "Input files") + files)
+def facts(c: Calibration) -> dict[str, dict[str, Any]]:
+    """Settings, effects that were tested, versions, wall times and sensor rates, by title."""
+    return {
+        "Settings": c.settings,
+        "Tested, not in the model": {name: _tested_words(effect) for name, effect in c.effects.items()},
+        "Versions": c.versions,
+        "Wall time [s]": {k: f"{v:.2f}" for k, v in c.timings.items()},
+        "Rates [Hz]": {k: f"{v:.4g}" for k, v in c.rates.items()},
+    }
 
 
 def _tested_words(effect: dict[str, Any]) -> str:
@@ -532,15 +502,10 @@ def _hover_texts(cv: CrossValidation, names: list[str]) -> list[str]:
     return [f"{name}, without part {g + 1}" for g in range(cv.segments) for name in names]
 
 
-def predicted_fits(cv: CrossValidation) -> Html:
-    """Table of the RMS of each kind of residual with the calibration from both halves, and from the other half
-    alone."""
-    if not cv.fits:
-        return element("p", "Each half alone leaves parameters so loose that its residuals in the other mean nothing.")
-    whitened, raw = "whitened RMS, took part", "RMS, took part"
-    headers = ("sensor", "kind", "residuals", whitened, "predicted", raw, "predicted", "more chi2")
-    body = [_row(f) for f in cv.fits if f.count]
-    return table(headers, body, headers[2:])
+def predicted_fits(cv: CrossValidation | None) -> list[tuple[object, ...]]:
+    """Rows of the RMS of each kind of residual with the calibration from both halves, and from the other half alone;
+    empty where each half alone leaves parameters too loose."""
+    return [_row(f) for f in cv.fits if f.count] if cv else []
 
 
 def _row(f: PredictedFit) -> tuple[object, ...]:

@@ -1,12 +1,16 @@
-"""Pictures of the report: recorded images, with measured and projected points drawn over them as SVG."""
+"""Pictures of the report that are drawn as SVG: recorded images with measured and projected points, and what is
+printed in place of 3D figures."""
 
 from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
+from icalib.report.figures import VIEW, Figure, thin
 from icalib.result import Calibration
 from icalib.result.calibration import PointsInImage, ReportImage
 from icalib.result.pictures import nearest
@@ -23,38 +27,49 @@ USUAL_PERCENTILE = 90.0  # of the residuals, which sets the magnification of the
 MOST_MARKS = 400  # measured points in a picture: more hide one another
 
 
-def figures(c: Calibration) -> Iterator[tuple[str, str]]:
-    """SVG and caption of each picture, two for those with a first guess."""
+@dataclass(frozen=True)
+class Line:
+    """A path of an SVG: class in page.css, path data, and its colour where the class has none."""
+
+    css: str
+    data: str
+    color: str = ""
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """An SVG with the caption `words`. size: width and height; texts: place and text; image: HTML id of an image below
+    the lines; jpeg: that image as base64, in the first drawing that has it."""
+
+    size: tuple[int, int]
+    words: str
+    lines: list[Line]
+    texts: list[tuple[float, float, str]] = field(default_factory=list)
+    image: str = ""
+    jpeg: str = ""
+
+
+def figures(c: Calibration) -> Iterator[Drawing]:
+    """Drawing of each picture, two for those with a first guess."""
     for number, picture in enumerate(c.pictures):
-        width, height = c.rig["sensors"][picture.camera]["resolution"]
-        jpeg = b64encode(picture.jpeg).decode()
-        box = f'x="-.5" y="-.5" width="{width}" height="{height}"'
-        image = f'<image id="shot-{number}" {box} preserveAspectRatio="none" href="data:image/jpeg;base64,{jpeg}"/>'
+        size = tuple(c.rig["sensors"][picture.camera]["resolution"])
+        image, jpeg = f"shot-{number}", b64encode(picture.jpeg).decode()
         if picture.after is None:
-            drawn, words = _corners(c, picture, width)
-            yield _svg(image + drawn, width, height), f"{_where(picture)}. {words}"
+            lines, words = _corners(c, picture, size[0])
+            yield Drawing(size, f"{_where(picture)}. {words}", lines, [], image, jpeg)
             continue
         ends = ends_of(picture.after)
-        outline = _path("outline", _lines(picture.outline))
-        for name, points in (("first guess", picture.before), ("as calibrated", picture.after)):
+        outline = Line("outline", _lines(picture.outline))
+        for name, points in (("First guess", picture.before), ("As calibrated", picture.after)):
             if points is not None:
                 words = f"{name}. {picture.sensor} in {_where(picture)}; {_scale(points, ends)}"
-                yield _svg(image + _dots(points, ends) + outline, width, height), words[0].upper() + words[1:]
-                image = f'<use href="#shot-{number}"/>'
+                yield Drawing(size, words, [*_dots(points, ends), outline], [], image, jpeg)
+                jpeg = ""
 
 
 def _where(picture: ReportImage) -> str:
     which = picture.file or f"at {picture.seconds:.2f} s"
     return f"{picture.camera} {which}, {picture.title}"
-
-
-def _svg(content: str, width: int, height: int) -> str:
-    return f'<svg class="shot" viewBox="-.5 -.5 {width} {height}" role="img">{content}</svg>'
-
-
-def _path(css: str, d: str, color: str = "") -> str:
-    stroke = f' stroke="{color}"' if color else ""
-    return f'<path class="{css}"{stroke} d="{d}"/>' if d else ""
 
 
 def ends_of(points: PointsInImage) -> tuple[float, float]:
@@ -75,14 +90,17 @@ def shades(points: PointsInImage, ends: tuple[float, float]) -> np.ndarray:
     return np.clip(len(NEAR_TO_FAR) * share, 0, len(NEAR_TO_FAR) - 1).astype(int)
 
 
-def _dots(points: PointsInImage, ends: tuple[float, float]) -> str:
+def _dots(points: PointsInImage, ends: tuple[float, float]) -> list[Line]:
     """Dots coloured by distance, the farthest first."""
-    colour = shades(points, ends)
-    parts = (
-        _path("dots", "".join(f"M{u:.0f} {v:.0f}h0" for u, v in points.uv[colour == k]), NEAR_TO_FAR[k])
+    return _coloured(points.uv, shades(points, ends))
+
+
+def _coloured(points: np.ndarray, colour: np.ndarray) -> list[Line]:
+    """Dots at points (n, 2) with the colours (n,) of NEAR_TO_FAR, the last colour first."""
+    return [
+        Line("dots", "".join(f"M{u:.0f} {v:.0f}h0" for u, v in points[colour == k]), NEAR_TO_FAR[k])
         for k in reversed(range(len(NEAR_TO_FAR)))
-    )
-    return "".join(parts)
+    ]
 
 
 def _lines(pen: np.ndarray) -> str:
@@ -93,7 +111,7 @@ def _lines(pen: np.ndarray) -> str:
     return "".join(f"{'M' if begins else 'L'}{u:.1f} {v:.1f}" for (u, v), lifted, begins in steps if not lifted)
 
 
-def _corners(c: Calibration, picture: ReportImage, width: int) -> tuple[str, str]:
+def _corners(c: Calibration, picture: ReportImage, width: int) -> tuple[list[Line], str]:
     """Measured points as squares, rejected ones as crosses, and residuals as magnified lines; and words on them."""
     r = next(r for r in c.image_residuals if r.sensor == picture.camera)
     k = int(nearest(r.seconds, np.array([picture.seconds]))[0])
@@ -111,7 +129,7 @@ def _corners(c: Calibration, picture: ReportImage, width: int) -> tuple[str, str
     )
     ends = zip(uv[has_residual], gain * residual[has_residual], strict=True)
     arrows = "".join(f"M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}" for (u, v), (du, dv) in ends)
-    drawn = _path("measured", squares) + _path("residual", arrows) + _path("rejected", crosses)
+    drawn = [Line("measured", squares), Line("residual", arrows), Line("rejected", crosses)]
     count = f"{(~rejected).sum()} {r.kind}" + (f", {rejected.sum()} rejected" if rejected.any() else "")
     return drawn, f"{count}; residuals are {gain:g} times as long"
 
@@ -124,3 +142,46 @@ def _gain(residual: np.ndarray, width: int) -> float:
     wanted = max(1.0, ARROW_SHARE * width / usual)
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(power * max(k for k in (1.0, 2.0, 5.0) if k * power <= wanted))
+
+
+# What is printed in place of a 3D figure, which needs a graphics card and leaves a blank on paper.
+
+WIDTH = 900  # of a picture, in units of its SVG; text is 20 high
+MARGIN = 60
+MOST_STATIC_POINTS = 4000  # of a cloud
+
+
+def static_picture(f: Figure) -> Drawing | None:
+    """Lines, dots and texts of a 3D figure, in parallel projection from where it is seen first; None for 2D ones."""
+    traces = [t for t in f["data"] if t["type"] == "scatter3d" and t.get("visible", True)]
+    points = [np.array([t["x"], t["y"], t["z"]], float).T @ _axes_of_view().T for t in traces]
+    if not traces or not np.isfinite(np.concatenate(points)).any():
+        return None
+    low, high = (g(np.concatenate(points), axis=0) for g in (np.nanmin, np.nanmax))
+    gain = (WIDTH - 2 * MARGIN) / max(high[0] - low[0], (high[1] - low[1]) / 0.7, 1e-9)
+    flat = [gain * (p - low) + MARGIN for p in points]
+    named = [(t["text"], p) for t, p in zip(traces, flat, strict=True) if "text" in t]
+    texts = [(u + 10, v - 8, text) for names, p in named for (u, v), text in zip(p, names, strict=True)]
+    lines = [x for t, p in zip(traces, flat, strict=True) for x in _trace(t, p)]
+    return Drawing((WIDTH, round(gain * (high[1] - low[1])) + 2 * MARGIN), "", lines, texts)
+
+
+def _axes_of_view() -> np.ndarray:
+    """(2, 3) directions to the right and downwards in the picture."""
+    back = np.array([VIEW["camera"]["eye"][k] for k in "xyz"])
+    right = np.cross([0.0, 0.0, 1.0], back)
+    down = np.cross(right, back)
+    return np.stack([right / np.linalg.norm(right), down / np.linalg.norm(down)])
+
+
+def _trace(t: dict[str, Any], points: np.ndarray) -> list[Line]:
+    """A 3D trace at points (n, 2) of the picture. Dots keep their colours, from red to blue for low to high values."""
+    if t["mode"].startswith("lines"):
+        color = t["line"]["color"]
+        return [Line("line", _lines(points), color if isinstance(color, str) else "#2563a8")]
+    some = thin(len(points), MOST_STATIC_POINTS)
+    values = t["marker"].get("color")
+    if not isinstance(values, list):
+        return [Line("spot", "".join(f"M{u:.0f} {v:.0f}h0" for u, v in points[some]), "#111827")]
+    share = np.array(values, float)[some] / t["marker"]["cmax"]
+    return _coloured(points[some], len(NEAR_TO_FAR) - 1 - np.clip(len(NEAR_TO_FAR) * share, 0, 11).astype(int))

@@ -20,9 +20,8 @@ from icalib.report.figures import (
     line,
     numbers,
     path_3d,
-    stacked_axes,
+    stacked_panels,
     thin,
-    y_of,
 )
 from icalib.result import Calibration, joint_covariance
 from icalib.result.pictures import scene_in_worlds
@@ -273,21 +272,3 @@ def convergence(c: Calibration) -> Figure:
     )
     log = axis("cost (chi^2 / 2)", type="log", exponentformat="power")
     return figure(traces, 380, xaxis=axis("step (x: rejected)", dtick=max(1, len(step) // 12)), yaxis=log)
-
-
-def stacked_panels(panels: list[tuple[np.ndarray, np.ndarray]], titles: tuple[str, ...], height: int) -> Figure:
-    """Stacked panels with lines of x, y and z. panels: times (n,) and values (n, 3) of each; height [px]."""
-    traces = [
-        line(
-            t,
-            v[:, i],
-            "xyz"[i],
-            AXIS_COLORS[i],
-            yaxis=y_of(p),
-            showlegend=p == 0,
-            line={"color": AXIS_COLORS[i], "width": 1},
-        )
-        for p, (t, v) in enumerate(panels)
-        for i in range(3)
-    ]
-    return figure(traces, height, **stacked_axes(list(titles)))

@@ -427,7 +427,7 @@ class Calibration:
         return one_line(self)
 
     def _repr_html_(self) -> str:
-        from icalib.result.quantities import summary_html
+        from icalib.report.page import summary_html
 
         return summary_html(self)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from math import floor, inf, isfinite, log10, radians
 from typing import Any
 
@@ -379,11 +378,10 @@ def times(fit: SensorFit) -> str:
     return f"{'' if dof_known(fit) else 'at least '}{excess(fit):.2g}x"
 
 
-# A calibration as text and as HTML, for the Python prompt and for notebooks.
+# A calibration as text, for the Python prompt.
 
 _HEAD = ("sensor", "parameter", "value", "std", "unit", "verdict")
 _RIGHT = (False, False, True, True, False, False)  # alignment of the columns: numbers are right-aligned
-_COLOURS = {"too uncertain": "#c62828", "unobservable": "#c62828", "weak": "#b26a00"}
 
 
 def one_line(c: Calibration) -> str:
@@ -405,27 +403,9 @@ def summary_text(c: Calibration) -> str:
     return "\n".join([f"Verdict: {c.verdict}", *_reasons(c), "", *lines])
 
 
-def summary_html(c: Calibration) -> str:
-    """The verdict with its reasons, and the table of `summary_text`, as HTML."""
-    head = "".join(f"<th>{name}</th>" for name in _HEAD)
-    body = "".join(f"<tr>{''.join(_html_cells(row))}</tr>" for row in table_rows(c))
-    reasons = "".join(f"<li>{escape(reason)}</li>" for reason in c.reasons)
-    listed = f"<ol>{reasons}</ol>" if reasons else ""
-    return (
-        f"<p><b>Verdict: {c.verdict}</b></p>{listed}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-    )
-
-
 def _reasons(c: Calibration) -> list[str]:
     return [f"Reason {k}: {reason}" for k, reason in enumerate(c.reasons, 1)]
 
 
 def _cells(row: Row) -> tuple[str, ...]:
     return row.sensor, row.name, row.value, row.std, row.unit, row.verdict
-
-
-def _html_cells(row: Row) -> list[str]:
-    colour = _COLOURS.get(row.verdict, "")
-    styles = ["text-align: right" if right else "text-align: left" for right in _RIGHT]
-    styles[-1] += f"; color: {colour}" if colour else ""
-    return [f'<td style="{style}">{escape(x)}</td>' for style, x in zip(styles, _cells(row), strict=True)]

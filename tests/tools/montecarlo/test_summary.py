@@ -150,8 +150,9 @@ def test_the_largest_error_is_of_what_counts(record, judged):
     assert summarise([]).largest is None and largest_words(summarise([])) == "No number was determined in any run."
 
 
-def test_on_the_page_each_figure_stands_under_its_heading(record, judged):
+def test_on_the_page_each_figure_stands_under_its_heading(record, judged, assert_drawn):
     runs = [judged(record(seed), "wheel0.radii", ("unobservable", "weak")) for seed in range(5)]
     page = study_html(summarise(runs), Identity("s.yaml", "0", "none", "known", "digest", {}), runs)
-    marks = ["<h2>Blocks", "The largest error of", "<h2>Mean NEES", 'id="nees"', "<h2>Unobservable", "<h2>Failed runs"]
+    marks = ["<h2>Blocks", "The largest error of", "<b>Mean NEES", 'id="nees"', "<h3>Unobservable", "<h3>Failed runs"]
     assert [page.index(m) for m in marks] == sorted(page.index(m) for m in marks)
+    assert_drawn(page, {"nees"})

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from icalib.report.figures import REJECTED, Figure, ResidualCurve, axis, dots, figure, line, numbers, thin
-from icalib.report.page import Html, Presenter, Section, element, html, plot_place
+from icalib.report.page import Group, Plot, Presenter, Section
 from icalib.report.rig_figures import PEN_UP
 from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
 from icalib.result.quantities import format_number
@@ -153,20 +153,19 @@ _LENS_WORDS = (
 def sections(c: Calibration) -> Iterator[Section]:
     """Sections of the report: residuals in images, if there are any, and the projection uncertainty of each lens."""
     if c.image_residuals:
-        figures, parts = {}, []
-        for i, r in enumerate(c.image_residuals):
-            width, height = c.rig["sensors"][r.sensor]["resolution"]
-            figures[f"plane-{i}"] = residual_plane(r)
-            figures[f"image-{i}"] = residuals_over_image(r, (width, height))
-            figures[f"time-{i}"] = residuals_over_time(r)
-            plots = [plot_place(f"{kind}-{i}", css) for kind, css in (("plane", ""), ("image", ""), ("time", "wide"))]
-            parts += [
-                element("h3", [html(r.sensor), element("small", f" {_counts(r)}")]),
-                element("div", plots, "pair"),
-            ]
-        yield Section("images", "Residuals in the images", _IMAGE_WORDS, Html("".join(parts)), figures)
+        groups = [Group(r.sensor, _residual_plots(c, i, r), _counts(r)) for i, r in enumerate(c.image_residuals)]
+        yield Section("images", "Residuals in the images", _IMAGE_WORDS, groups)
     if c.cameras:
         yield _projection_section(c)
+
+
+def _residual_plots(c: Calibration, i: int, r: ImageResiduals) -> list[Plot]:
+    width, height = c.rig["sensors"][r.sensor]["resolution"]
+    return [
+        Plot(f"plane-{i}", residual_plane(r), "Distribution"),
+        Plot(f"image-{i}", residuals_over_image(r, (width, height)), "Over the image"),
+        Plot(f"time-{i}", residuals_over_time(r), "Over time", wide=True),
+    ]
 
 
 def _counts(r: ImageResiduals) -> str:
@@ -181,18 +180,16 @@ def _projection_section(c: Calibration) -> Section:
     """Section with maps of projection uncertainty, named `projection-i-0` and `projection-i-1` for camera i.
 
     A camera with a fixed lens has a sentence instead."""
-    figures, parts = {}, []
+    groups = []
     for i, name in enumerate(c.cameras):
         size, residuals = c.rig["sensors"][name]["resolution"], [r for r in c.image_residuals if r.sensor == name]
-        maps = []
-        for k, m in enumerate(projection_maps(c, name)):
-            place = f"projection-{i}-{k}"
-            figures[place] = projection_figure(m, residuals, size)
-            title = element("h3", f"{name}: {map_title(m).lower()}")
-            maps.append(element("div", [title, element("p", map_words(m)), plot_place(place)]))
+        maps = [
+            Plot(f"projection-{i}-{k}", projection_figure(m, residuals, size), map_title(m), map_words(m))
+            for k, m in enumerate(projection_maps(c, name))
+        ]
         fixed = f"{name}: intrinsics and distortion are fixed by the rig file, and taken as exact."
-        parts.append(element("div", maps, "pair") if maps else element("p", fixed, "quiet"))
-    return Section("projection", "How well each lens is known", _LENS_WORDS, Html("".join(parts)), figures)
+        groups.append(Group(plots=maps, words="" if maps else fixed))
+    return Section("projection", "How well each lens is known", _LENS_WORDS, groups)
 
 
 def curves(r: ImageResiduals) -> Iterator[ResidualCurve]:
@@ -291,7 +288,8 @@ def _round(step: float) -> float:
 
 def map_title(m: ProjectionMap) -> str:
     """Title of a map: the distance of the points."""
-    return "Points far away" if np.isinf(m.range_m) else f"Points {format_number(m.range_m)} m away, like those it saw"
+    where = "far away" if np.isinf(m.range_m) else f"{format_number(m.range_m)} m away, like those it saw"
+    return f"{m.camera}: points {where}"
 
 
 def map_words(m: ProjectionMap) -> str:

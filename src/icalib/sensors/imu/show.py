@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from icalib.report.figures import Figure, ResidualCurve, thin
-from icalib.report.page import Presenter, Section, plot_place
-from icalib.report.rig_figures import MAX_PLOTTED_KEYFRAMES, stacked_panels
+from icalib.report.figures import Figure, ResidualCurve, stacked_panels, thin
+from icalib.report.page import Group, Plot, Presenter, Section
+from icalib.report.rig_figures import MAX_PLOTTED_KEYFRAMES
 from icalib.result import Calibration
 from icalib.sensors.imu.stream import ImuResiduals
 
@@ -23,8 +23,8 @@ def sections(c: Calibration) -> Iterator[Section]:
     for k, residuals in enumerate(c.imu_residuals):
         title = f"Residuals of {residuals.sensor}" if len(c.imu_residuals) > 1 else "IMU residuals"
         place = f"imu-residuals-{k}" if k else "imu-residuals"
-        figures = {place: _residual_figure(residuals)}
-        yield Section(f"inertial-{k}" if k else "inertial", title, _WORDS, plot_place(place), figures)
+        plot = Plot(place, _residual_figure(residuals), f"{residuals.sensor}: residuals over time")
+        yield Section(f"inertial-{k}" if k else "inertial", title, _WORDS, [Group(plots=[plot])])
 
 
 def _residual_figure(r: ImuResiduals) -> Figure:

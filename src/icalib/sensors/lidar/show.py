@@ -20,7 +20,7 @@ from icalib.report.figures import (
     path_3d,
     thin,
 )
-from icalib.report.page import Html, Presenter, Section, element, html, plot_place
+from icalib.report.page import Group, Plot, Presenter, Section
 from icalib.report.rig_figures import CIRCLE, PEN_UP
 from icalib.result import Calibration, Plane
 from icalib.sensors.lidar.stream import LidarResiduals
@@ -34,7 +34,7 @@ MAX_COLOR_RMS = 4.0  # end of the colour scale, in RMS of the result
 MAX_RESIDUAL_RMS = 5.0  # end of the residual axis, in RMS of the residuals
 MIN_SLOPE = 0.1  # sine; the outline of a flatter plane is aligned with the axes of the world
 _WALL = "#64748b"
-_MAPS = (("As the first guess had them", "map-before"), ("As calibrated", "map-after"))
+_MAPS = (("Points as the first guess had them", "map-before"), ("Points as calibrated", "map-after"))
 _SECTION_WORDS = (
     "Planes in the world, and distances of points from them. A good calibration leaves thin planes of one colour, and "
     "a mean without a pattern in time and distance. The planes of the first guess are those that fit its points "
@@ -48,19 +48,20 @@ def sections(c: Calibration) -> Iterator[Section]:
     """One section: maps of the planes before and after, then residuals of each LiDAR."""
     if not c.lidar_residuals:
         return
-    maps = [element("div", [element("h3", title), plot_place(name, "")]) for title, name in _MAPS]
-    parts, figures = [element("div", maps, "pair")], plane_maps(c)
+    maps = plane_maps(c)
+    groups = [Group(plots=[Plot(name, maps[name], title) for title, name in _MAPS])]
     for i, r in enumerate(c.lidar_residuals):
         first, now = (1e3 * float(np.sqrt(np.mean(x.astype(np.float64) ** 2))) for x in (r.first_residual, r.residual))
         counts = (
             f"{r.points_used} of {r.points_read} points used; off their planes {first:.1f} mm RMS at first, "
             f"{now:.1f} mm now"
         )
-        head = element("h3", [html(r.sensor), element("small", f" {counts}")])
-        plots = [plot_place(f"points-{i}", ""), plot_place(f"distance-{i}", "")]
-        parts.append(Html(head + element("div", plots, "pair")))
-        figures |= {f"points-{i}": residuals_over_time(r), f"distance-{i}": residuals_over_distance(r)}
-    yield Section("points", "LiDAR points on planes", _SECTION_WORDS, Html("".join(parts)), figures)
+        plots = [
+            Plot(f"points-{i}", residuals_over_time(r), "Over time"),
+            Plot(f"distance-{i}", residuals_over_distance(r), "Over distance"),
+        ]
+        groups.append(Group(r.sensor, plots, counts))
+    yield Section("points", "LiDAR points on planes", _SECTION_WORDS, groups)
 
 
 def curves(r: LidarResiduals) -> Iterator[ResidualCurve]:

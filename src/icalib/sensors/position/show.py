@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from icalib.report.figures import COLORS, Figure, axis, dots, figure, line, thin
-from icalib.report.page import Html, Presenter, Section, element, plot_place, row_sections
+from icalib.report.page import Group, Plot, Presenter, Section, row_sections
 from icalib.result import Calibration, RowResiduals
 
 OUTLIER_SIGMA = 3.0  # standard deviations: white noise exceeds it in 1 of 34 fixes (chi, three degrees of freedom)
@@ -26,11 +26,9 @@ _MAP = (
 def sections(c: Calibration) -> Iterator[Section]:
     """Residuals of each position sensor, and the map."""
     yield from row_sections(c, "position", "positions", "Residuals of position sensors", _WORDS)
-    figures = {f"map-{i}": _map(c, r) for i, r in enumerate(_residuals_of_positions(c))}
-    if figures:
-        places = zip(figures, _residuals_of_positions(c), strict=True)
-        parts = [element("h3", r.sensor) + plot_place(name) for name, r in places]
-        yield Section("maps", "Map of fixes", _MAP, Html("".join(parts)), figures)
+    plots = [Plot(f"map-{i}", _map(c, r), r.sensor) for i, r in enumerate(_residuals_of_positions(c))]
+    if plots:
+        yield Section("maps", "Map of fixes", _MAP, [Group(plots=plots)])
 
 
 def amounts(c: Calibration) -> Iterator[str]:

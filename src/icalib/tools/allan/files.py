@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from math import floor, log10
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from rich.text import Text
 
 from icalib.base.files import check_writable, json_text, printable, refuse_foreign, sealed_texts, write_texts
 from icalib.report.figures import AXIS_COLORS, Figure, axis, figure, line
-from icalib.report.page import Html, document, element, html, resource, sentences
+from icalib.report.page import Plot, document
 from icalib.tools.allan.analysis import AXES, AllanFit, ImuNoiseStudy, SensorNoise, model_variance
 
 FILES = ("allan.html", "noise.yaml", "allan.json")
@@ -47,17 +46,18 @@ _HEADERS = ("", "noise density", "bias walk", "bias instability")
 
 def allan_html(study: ImuNoiseStudy) -> str:
     """The page as one HTML document, plotly.js included."""
-    figures = {sensor.kind: deviation_figure(sensor, study.period) for sensor in study.sensors}
-    words = {"name": study.name, "seconds": f"{study.seconds:.0f}", "rate": f"{1.0 / study.period:.6g}"}
-    words |= {"snippet": rig_snippet(study), "where": study.where}
-    parts = {
-        "table": _table(study),
-        "warnings": sentences(study.warnings, "care", "None."),
-        "notes": sentences(study.notes, "", "None."),
-    }
-    escaped = {name: html(value) for name, value in words.items()}
-    body = Template(resource("icalib.tools.allan", "page.html")).substitute(escaped | parts)
-    return document(f"Noise of {study.name}", body, figures)
+    plots = [Plot(s.kind, deviation_figure(s, study.period), s.kind.capitalize()) for s in study.sensors]
+    return document(
+        "tools/allan/page.html",
+        plots,
+        title=f"Noise of {study.name}",
+        summary=f"{study.where}, {study.seconds:.0f} s at rest, {1.0 / study.period:.6g} Hz",
+        headers=_HEADERS,
+        rows=[cells for sensor in study.sensors for cells in rows(sensor)],
+        snippet=rig_snippet(study),
+        study=study,
+        plots_of_sensors=plots,
+    )
 
 
 def deviation_figure(sensor: SensorNoise, period: float) -> Figure:
@@ -84,13 +84,6 @@ def deviation_figure(sensor: SensorNoise, period: float) -> Figure:
         xaxis=axis("averaging time [s]", **log),
         yaxis=axis(f"Allan deviation [{sensor.unit}]", **log),
     )
-
-
-def _table(study: ImuNoiseStudy) -> Html:
-    head = element("thead", element("tr", [element("th", header) for header in _HEADERS]))
-    cells_of_rows = [cells for sensor in study.sensors for cells in rows(sensor)]
-    body = element("tbody", [element("tr", [element("td", cell) for cell in cells]) for cells in cells_of_rows])
-    return element("div", element("table", [head, body]), "scroll")
 
 
 _UNITS = {"gyroscope": ("rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"), "accelerometer": ("m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)")}

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.so3 import rpy
 from icalib.report.figures import AXIS_COLORS, COLORS, Figure, figure, numbers, stacked_axes, y_of
-from icalib.report.page import Html, document, element, html, plot_place, resource, sentences, table
+from icalib.report.page import Plot, document
 from icalib.result.quantities import TURNS
 from icalib.result.verdict import EXIT_CODES
 from icalib.sensors.parameter import display_unit
@@ -26,91 +25,45 @@ from icalib.tools.batch import replacing
 from icalib.tools.comparison.compare import digits
 from icalib.tools.fleet.result import JOBS, Drift, Fleet, GroupChange, GroupRecord, JobResult, by_robot
 
-_BADGES = {"done": "determined", "failed": "bad"}  # green, red
-
 
 def fleet_html(fleet: Fleet, title: str) -> str:
     """The page as one HTML document; title: name of the file of jobs."""
-    figures, folds = _over_time(fleet)
-    texts = {
-        "title": title,
-        "answer": answer(fleet),
-        "chance": chance_words(fleet) if any(d.n_tested for d in fleet.drifts) else "",
-        "limit": f"{fleet.limit:g}",
-        "trust": "bad" if fleet.failed else ("care" if fleet.drifted else "good"),
-    }
-    parts = {
-        "failures": _titled("Failed", failures(fleet), "bad"),
-        "changes": _titled("Changed", changes(fleet), "care"),
-        "aside": _aside(len(unsure(fleet))),
-        "robots": _robots(fleet),
-        "figures": folds,
-        "jobs": _jobs(fleet),
-        "unsure": sentences(unsure(fleet), "", "None."),
-        "notes": sentences(notes(fleet), "", "None."),
-    }
-    escaped = {name: html(text) for name, text in texts.items()}
-    body = Template(resource("icalib.tools.fleet", "page.html")).substitute(escaped | parts)
-    return document(f"Fleet of {title}", body, figures)
+    folds = _over_time(fleet)
+    return document(
+        "tools/fleet/page.html",
+        [plot for _, _, plots in folds for plot in plots],
+        title=f"Fleet of {title}",
+        answer=answer(fleet),
+        chance=chance_words(fleet) if any(d.n_tested for d in fleet.drifts) else "",
+        limit=f"{fleet.limit:g}",
+        trust="bad" if fleet.failed else ("care" if fleet.drifted else "good"),
+        failures=failures(fleet),
+        changes=changes(fleet),
+        robot_headers=ROBOT_HEADERS,
+        robots=[(robot, jobs, failed or "", *rest) for robot, jobs, failed, *rest in robot_rows(fleet)],
+        folds=folds,
+        jobs=[(f"{JOBS}/{r.job.name}/report.html" if r.record.blocks else "", _job(fleet, r)) for r in fleet.results],
+        unsure=unsure(fleet),
+        notes=notes(fleet),
+    )
 
 
-def _titled(title: str, lines: list[str], css: str) -> Html:
-    return Html(element("h3", title) + sentences(lines, css, "")) if lines else Html("")
-
-
-def _aside(count: int) -> Html:
-    """Paragraph with a link to the `count` differences that cannot be tested; empty if there are none."""
-    if not count:
-        return Html("")
-    return element("p", [Html('<a href="#facts">Cannot be judged</a>'), f": {count} more, not determined or typed."])
-
-
-def _robots(fleet: Fleet) -> Html:
-    body = [(robot, jobs, failed or "", *rest) for robot, jobs, failed, *rest in robot_rows(fleet)]
-    return Html(element("h3", "Robots") + table(ROBOT_HEADERS, body, ROBOT_HEADERS[1:3]))
-
-
-def _over_time(fleet: Fleet) -> tuple[dict[str, Figure], Html]:
-    """Figures by the id of their placeholder, and a collapsible section for each robot with several calibrations."""
-    robots, figures, folds = by_robot(fleet.results), dict[str, Figure](), list[Html]()
+def _over_time(fleet: Fleet) -> list[tuple[str, bool, list[Plot]]]:
+    """Name, whether it changed, and a plot of each sensor, of each robot with several calibrations."""
+    robots, folds = by_robot(fleet.results), []
     for i, drift in enumerate(fleet.drifts):
         results = robots[drift.robot]
-        if len(results) < 2:
-            continue
-        parts = [element("summary", drift.robot)]
-        for k, sensor in enumerate(sensors(results)):
-            figures[f"time-{i}-{k}"] = over_time(results, sensor)
-            parts += [element("h3", sensor), plot_place(f"time-{i}-{k}")]
-        opening = "<details open>" if drift.changes else "<details>"
-        folds.append(Html(f"{opening}{html(list(parts))}</details>"))
-    return figures, html(list(folds)) if folds else element("p", "No robot has two calibrations.", "quiet")
+        if len(results) > 1:
+            plots = [Plot(f"time-{i}-{k}", over_time(results, s), s) for k, s in enumerate(sensors(results))]
+            folds.append((drift.robot, bool(drift.changes), plots))
+    return folds
 
 
-def _jobs(fleet: Fleet) -> Html:
-    body = [
-        (
-            _link(r),
-            r.job.robot,
-            time_words(r.time),
-            _status(r),
-            care_words(r),
-            f"{r.record.seconds:.1f}",
-            r.record.failure or fleet.again.get(r.job.name, ""),
-        )
-        for r in fleet.results
-    ]
-    return table(("job", "robot", "time", "status", "to know", "took [s]", "why"), body, ("took [s]",))
-
-
-def _link(one: JobResult) -> Html:
-    """Link to the job's report; only the name if it has none. Job names are valid folder names, so that the URL needs
-    no quoting."""
-    name = html(one.job.name)
-    return Html(f'<a href="{JOBS}/{name}/report.html">{name}</a>') if one.record.blocks else name
-
-
-def _status(one: JobResult) -> Html:
-    return element("span", one.status, f"badge {_BADGES[one.status]}")
+def _job(fleet: Fleet, r: JobResult) -> tuple[str, ...]:
+    """Cells of a job in the table of jobs."""
+    why = r.record.failure or fleet.again.get(r.job.name, "")
+    seconds = f"{r.record.seconds:.1f}"
+    return r.job.name, r.status, r.job.robot, time_words(r.time), care_words(r), seconds, why
 
 
 # Figures of a robot's parameters over time: differences from the first calibration, with one-sigma error bars.

@@ -17,12 +17,12 @@ import numpy as np
 from icalib.base.extras import load_matplotlib
 from icalib.base.files import refuse_foreign, sealed
 from icalib.report.figures import COLORS, Figure, axis, figure, line
-from icalib.report.page import Html, element, plot_place
+from icalib.report.page import Plot
 from icalib.sensors.parameter import display_unit
 from icalib.tools.batch import write_atomically
 from icalib.tools.montecarlo.record import GroupErrors, RunRecord
 from icalib.tools.montecarlo.study import Study, StudyPlan, run_study, scenario_digest
-from icalib.tools.montecarlo.summary import answer, blocks_table, failures, failures_words, largest_words, page
+from icalib.tools.montecarlo.summary import page
 from icalib.tools.simulation import load_scenario
 
 MOTIONS = {"3d": "Motion in three dimensions", "planar": "Planar motion"}
@@ -54,25 +54,15 @@ def reproduce(output: Path, plan: StudyPlan, progress: Progress = lambda *_: Non
 
 def write_figures(output: Path, studies: dict[str, Study]) -> None:
     """Writes reproduce.html, and a PNG picture for each motion in which at least one run reached a result."""
-    sections: list[Html] = []
-    figures: dict[str, Figure] = {}
+    sections = {}
     for motion, study in studies.items():
-        consistency = study.consistency
-        sections += [element("h2", MOTIONS[motion]), element("p", answer(consistency)), blocks_table(consistency)]
-        sections += [
-            element("p", largest_words(consistency)),
-            element("p", failures_words(consistency)),
-            failures(consistency),
-        ]
         drawn = rows(study.records)
-        for row in drawn:
-            name = f"{motion}-{row.key}"
-            figures[name] = plotly_figure(row)
-            sections.append(plot_place(name))
+        plots = [Plot(f"{motion}-{row.key}", plotly_figure(row), row.key) for row in drawn]
+        sections[MOTIONS[motion]] = (study.consistency, plots)
         if drawn:
             write_atomically(output / _picture(motion), sealed(png(drawn, MOTIONS[motion])))
     words = "Error (lines) and 3 sigma (dashed) at the iterations of the solver, from guesses drawn about the truth."
-    write_atomically(output / PAGE, sealed(page("Monte-Carlo runs of the paper", words, sections, figures).encode()))
+    write_atomically(output / PAGE, sealed(page("Monte-Carlo runs of the paper", (words,), sections).encode()))
 
 
 def _picture(motion: str) -> str:
@@ -113,7 +103,7 @@ class PanelRow:
 
 def rows(records: Sequence[RunRecord]) -> tuple[PanelRow, ...]:
     """Panels of the first MOST_RUNS runs that did not fail, a row for each block. Of the cameras only the first is
-    shown, as in the iCalib paper."""
+    sections, as in the iCalib paper."""
     runs = [r for r in sorted(records, key=lambda r: r.seed) if not r.failure][:MOST_RUNS]
     blocks = {b.key: b for r in runs for b in r.blocks}
     lenses = [b.sensor for b in blocks.values() if b.name == "distortion"]

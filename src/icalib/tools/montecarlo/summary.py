@@ -6,13 +6,12 @@ import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from string import Template
 
 import numpy as np
 from scipy.special import erf, gammaincinv
 
 from icalib.report.figures import COLORS, Figure, axis, figure, numbers
-from icalib.report.page import Html, document, element, html, plot_place, resource, sentences, table
+from icalib.report.page import Plot, document
 from icalib.result.quantities import format_number
 from icalib.result.verdict import UNUSABLE
 from icalib.sensors.parameter import display_unit
@@ -406,51 +405,58 @@ MEAN = ("sensor", "kind", "mean over runs")
 
 def study_html(consistency: Consistency, identity: Identity, records: Sequence[RunRecord]) -> str:
     """The page as one HTML document."""
-    sections = [
-        element("h2", "Blocks"),
-        blocks_table(consistency),
-        element(
-            "p",
-            "Sampled / predicted: square roots of the smallest and the largest eigenvalue of the sampled "
-            "covariance relative to the predicted one; by chance: the range of these in 95 of 100 studies of a "
-            "consistent covariance.",
-        ),
-        element("p", largest_words(consistency)),
-        element("h2", "Mean NEES"),
-        plot_place("nees"),
-        *_unobservable(consistency),
-        element("h2", "Failed runs"),
-        element("p", failures_words(consistency)),
-        failures(consistency),
-        element("h2", "Residuals"),
-        _residuals(consistency),
-        element("h2", "Made from"),
-        table(("what", "value"), _facts(identity, records)),
-    ]
-    return page(f"Consistency, {identity.scenario}", answer(consistency), sections, {"nees": nees_figure(consistency)})
+    facts = _facts(identity, records)
+    summary, nees = (answer(consistency),), [Plot("nees", nees_figure(consistency), "Mean NEES of each block")]
+    return page(f"Consistency, {identity.scenario}", summary, {"Blocks": (consistency, nees)}, facts)
 
 
-def page(title: str, summary: str, sections: Sequence[Html], figures: dict[str, Figure]) -> str:
-    """HTML document in the style of the reports, from its sections and figures."""
-    body = Template(resource("icalib.tools.montecarlo", "page.html")).substitute(
-        title=html(title), answer=html(summary), sections="".join(sections)
+def page(
+    title: str,
+    summary: Sequence[str],
+    studies: dict[str, tuple[Consistency, list[Plot]]],
+    facts: Sequence[tuple[str, object]] = (),
+) -> str:
+    """HTML document of one study, or of several, each with its plots. facts: what they were made from."""
+    return document(
+        "tools/montecarlo/page.html",
+        [plot for _, plots in studies.values() for plot in plots],
+        title=title,
+        summary=summary,
+        studies={name: _study_values(*study) for name, study in studies.items()},
+        headers=_HEADERS,
+        numeric=NUMBERS,
+        mean=MEAN,
+        facts=facts,
     )
-    return document(title, body, figures)
 
 
-def failures(consistency: Consistency) -> Html:
-    """List of the failed runs, each with its message."""
-    return sentences([f"seed {f.seed}: {f.sentence}" for f in consistency.failures], "bad", "")
+_HEADERS = (*HEADERS, "by chance", "verdicts")
 
 
-def blocks_table(consistency: Consistency) -> Html:
-    headers = (*HEADERS, "by chance", "verdicts")
-    body: list[tuple[str, ...]] = [
+def _study_values(consistency: Consistency, plots: list[Plot]) -> dict[str, object]:
+    """What the template shows of a study."""
+    return {
+        "answer": answer(consistency),
+        "blocks": _block_rows(consistency),
+        "largest": largest_words(consistency),
+        "plots": plots,
+        "unobservable": unobservable_words(consistency),
+        "failed": failures_words(consistency),
+        "failures": [f"seed {f.seed}: {f.sentence}" for f in consistency.failures],
+        "residuals": {
+            "chi2 per post-fit degree of freedom": list(map(mean_cells, consistency.sizes)),
+            "Correlation with the next one in time": list(map(mean_cells, consistency.lag1)),
+        },
+    }
+
+
+def _block_rows(consistency: Consistency) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = [
         (*block_row(b), chance_words(b.spread), verdict_words(b)) for b in consistency.blocks
     ]
     if consistency.whole is not None:
-        body.append(("all together", "", "", *nees_cells(consistency.whole), *[""] * (len(headers) - 5)))
-    return table(headers, body, NUMBERS)
+        rows.append(("all together", "", "", *nees_cells(consistency.whole), *[""] * (len(_HEADERS) - 5)))
+    return rows
 
 
 def nees_figure(consistency: Consistency) -> Figure:
@@ -479,28 +485,15 @@ def nees_figure(consistency: Consistency) -> Figure:
     return figure([bounds, means], xaxis=axis("", automargin=True), yaxis=axis("NEES per degree of freedom"))
 
 
-def _unobservable(consistency: Consistency) -> list[Html]:
-    """Section on what was unobservable in at least one run; empty if nothing was."""
-    if not consistency.unobservable:
-        return []
-    return [element("h2", "Unobservable"), sentences(unobservable_words(consistency), "care", "None.")]
-
-
-def _residuals(consistency: Consistency) -> Html:
-    sizes = [element("h3", "chi2 per post-fit degree of freedom"), table(MEAN, map(mean_cells, consistency.sizes))]
-    lags = [element("h3", "Correlation with the next one in time"), table(MEAN, map(mean_cells, consistency.lag1))]
-    return element("div", [element("section", sizes), element("section", lags)], "grid")
-
-
 def _facts(identity: Identity, records: Sequence[RunRecord]) -> list[tuple[str, object]]:
     seconds = float(np.median([r.seconds for r in records]))
     return [
         ("scenario", identity.scenario),
-        ("sha256", element("code", identity.scenario_sha256)),
+        ("sha256", identity.scenario_sha256),
         ("first guess", identity.guess),
         ("planes of LiDARs", identity.planes),
         ("seeds", f"{records[0].seed} to {records[-1].seed}"),
         ("time of a run", f"{seconds:.1f} s (median)"),
-        ("program", element("code", identity.program)),
+        ("program", identity.program),
         *identity.versions.items(),
     ]
