@@ -175,7 +175,7 @@ def test_what_the_recording_does_not_show_of_an_imu_is_as_the_prior_says():
     assert np.abs(group.value / sigma)[unknown].max() < 0.2
     rotation, C = found.group("cam0", "rotation"), found.covariance
     by_prior = C[np.ix_(not_none(rotation.columns), not_none(group.columns))] / sigma
-    np.testing.assert_allclose(not_none(rotation.std_imu), np.linalg.norm(by_prior, axis=1), rtol=2e-3)
+    np.testing.assert_allclose(rotation.std_by["imu0.intrinsics"], np.linalg.norm(by_prior, axis=1), rtol=2e-3)
     for camera in ("cam0", "cam1"):
         for name in ("translation", "time_offset"):
             a, b = found.group(camera, name), ideal.group(camera, name)

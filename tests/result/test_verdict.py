@@ -20,6 +20,7 @@ from icalib.result import Calibration, load_calibration, relative_pose, verdict
 from icalib.result.quantities import rows
 from icalib.result.verdict import EXIT_CODES, NEXT, component_verdict, lens_projection_px
 from icalib.sensors.imu.spec import class_imperfections
+from icalib.validation.assess import unseen_notes
 
 LARGE = remark("it is too large.")
 
@@ -136,7 +137,8 @@ def test_the_prior_of_the_imu_is_named_before_motion_is_asked_for(calibration: C
     """Where it contributes most of the variance: here of cam0, not of cam1."""
     c, share = with_verdicts(calibration, verdict, ("rotation",)), {"cam0": 0.8, "cam1": 0.6}
     groups = tuple(
-        dataclasses.replace(g, std_imu=share[g.sensor] * g.std) if g.name == "rotation" else g for g in c.groups
+        dataclasses.replace(g, std_by={"imu0.intrinsics": share[g.sensor] * g.std}) if g.name == "rotation" else g
+        for g in c.groups
     )
     intrinsics = {"prior": [0.0] * 24, "sigma": class_imperfections("consumer").sigma.tolist()}
     sensors = c.rig["sensors"] | {"imu0": c.rig["sensors"]["imu0"] | {"intrinsics": intrinsics}}
@@ -146,6 +148,18 @@ def test_the_prior_of_the_imu_is_named_before_motion_is_asked_for(calibration: C
     assert "prior on IMU intrinsics of a consumer IMU" in first and "`intrinsics: fixed`" in first
     assert "record" not in first and "cam1" not in first
     assert second.startswith("cam1 rotation x (std") and "record longer" in second
+
+
+def test_what_makes_up_most_of_a_standard_deviation_is_noted(calibration: Calibration):
+    g = calibration.group("cam0", "time_offset")
+    std = 1e3 * g.std[0]
+    most, less = (dataclasses.replace(g, std_by={"board0.size": share * g.std}) for share in (0.8, 0.7))
+    (note,) = unseen_notes([most, less])
+    assert (
+        f"the size of board0, which makes up most of the standard deviation of cam0 time offset ({0.8 * std:.2g} of"
+        in note
+    )
+    assert not list(unseen_notes([less]))
 
 
 def test_a_lens_is_judged_by_its_projection(calibration: Calibration):

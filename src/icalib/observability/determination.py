@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -88,13 +88,14 @@ class Determined:
             + self.shifts.T @ self.shifts
         )
 
-    def prior_variance(self, sensor: str | None = None) -> np.ndarray:
-        """(B,) contribution of the priors on nuisance parameters, of `sensor` or of all, to the diagonal of the
-        covariance. Information that noise in the Jacobian adds is subtracted first, as in `error_covariance`."""
-        problem = self.estimate.problem
+    @cached_property
+    def prior_variances(self) -> dict[Key, np.ndarray]:
+        """(B,) contribution of the prior on each group of nuisance parameters to the diagonal of the covariance.
+        Information that noise in the Jacobian adds is subtracted first, as in `error_covariance`."""
+        problem, state = self.estimate.problem, self.estimate.outcome.state
         root = problem.tolerance[:, None] * restricted_root(self._known, self.fixed_directions)
-        priors = [p for p in nuisance_priors(problem) if sensor in (None, p.block.sensor)]
-        return variance_of_priors(root @ root.T, priors, self.estimate.outcome.state)
+        covariance = root @ root.T
+        return {p.block.key: variance_of_priors(covariance, [p], state) for p in nuisance_priors(problem)}
 
     @property
     def _known(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -443,11 +444,11 @@ class Effect:
 
 
 class EffectsLeftOut(NamedTuple):
-    """Effects that an estimate leaves out: all that were tested; and shifts (n, B) of the calibration parameters whose
-    outer products add to their covariance, one for each effect that is considered."""
+    """Effects that an estimate leaves out: all that were tested; and for each effect that is considered the shift (B,)
+    of the calibration parameters whose outer product adds to their covariance."""
 
-    tested: tuple[Effect, ...]
-    shifts: np.ndarray
+    tested: tuple[Effect, ...] = ()
+    shifts: Mapping[Key, np.ndarray] = MappingProxyType({})
 
 
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
@@ -458,7 +459,7 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     specs = {key: spec for key, spec in specs.items() if freed.layout.is_free(*key)}
     single = [key for key, spec in specs.items() if spec.size == 1]
     if not specs or (linearised := _linearised(freed, estimate, single)) is None:
-        return EffectsLeftOut((), np.zeros((0, inputs.layout.size)))
+        return EffectsLeftOut()
     freed_estimate = _FreedEstimate(inputs.layout, *linearised)
     return EffectsLeftOut(freed_estimate.effects(specs, freed), freed_estimate.considered(specs))
 
@@ -518,18 +519,18 @@ class _FreedEstimate:
             out.append(Effect(key[0], specs[key], step[k], std[k], chi2, gain[key], moves))
         return tuple(out)
 
-    def considered(self, specs: Mapping[Key, ParameterSpec]) -> np.ndarray:
-        """(n, B) responses of the calibration parameters to effects that are considered (Schmidt 1966). Each is as
+    def considered(self, specs: Mapping[Key, ParameterSpec]) -> dict[Key, np.ndarray]:
+        """(B,) responses of the calibration parameters to effects that are considered (Schmidt 1966). Each is as
         large as the RMS error that prior and data allow it, all fixed values being right."""
-        rows = [np.zeros((0, self.before.size))]
+        shifts = dict[Key, np.ndarray]()
         for key in (key for key, spec in specs.items() if spec.is_considered):
             k = self.problem.layout.columns(*key)
             step, root = self._step_of([*self._estimated, *k])
             by_data, by_prior = float((root[k] ** 2).sum()), specs[key].prior_sigma ** 2
             weight = by_prior / (by_prior + by_data)
             rms = np.sqrt(weight * by_data + (weight * step[k[0]]) ** 2)
-            rows.append(rms * self._response(k).T)
-        return np.vstack(rows)
+            shifts[key] = rms * self._response(k)[:, 0]
+        return shifts
 
     @cached_property
     def _estimated(self) -> np.ndarray:

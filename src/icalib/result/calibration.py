@@ -54,7 +54,8 @@ class ParameterGroup:
     mode: str  # free, fixed, prior
     columns: tuple[int, ...] | None = None
     factor: np.ndarray | None = None  # (n,) empirical factor, of which only values above 1 scale std_formal
-    std_imu: np.ndarray | None = None  # (n,) part of std that the prior on IMU intrinsics contributes
+    # (n,) part of std that the recording does not reduce, by its source: "imu0.intrinsics", "board0.size"
+    std_by: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

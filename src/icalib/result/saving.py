@@ -48,7 +48,7 @@ from icalib.sensors.stream import Residuals, RowResiduals
 
 # Writes a `Calibration` to files and reads it back without loss of precision. File formats: docs/files.md.
 
-FORMAT, FORMAT_VERSION = "icalib result", 4
+FORMAT, FORMAT_VERSION = "icalib result", 5
 RECORDS = (ImuResiduals, CornerResiduals, TrackResiduals, LidarResiduals)  # others are `RowResiduals`
 _REMARKS = ("unobservable", "warnings", "notes", "wrong")
 _UNKNOWN = "unknown"  # identifier of each sentence of an earlier result, which has none
@@ -62,7 +62,9 @@ def calibration_files(calibration: Calibration) -> dict[str, bytes]:
     return {
         "calibration.yaml": sealed(printable(calibration_yaml(calibration)).encode()),
         "result.json": sealed(
-            printable(json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False)).encode()
+            printable(
+                json.dumps(_plain(calibration, arrays), indent=1, ensure_ascii=False, default=np.ndarray.tolist)
+            ).encode()
         ),
         "result.npz": arrays,
     }
@@ -91,11 +93,11 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "npz_sha256": hashlib.sha256(arrays).hexdigest(),
-        "groups": [_lists(g) for g in c.groups],
+        "groups": [vars(g) for g in c.groups],
         "fits": [dataclasses.asdict(f) for f in c.fits],
         "recordings": [dataclasses.asdict(r) for r in c.recordings],
         "residuals": [_without_arrays(r) for r in c.residuals.values()],
-        "planes": [_lists(p) for p in c.planes],
+        "planes": [vars(p) for p in c.planes],
         "cross_validation": None if c.cross_validation is None else _plain_cross_validation(c.cross_validation),
         "verdict": c.verdict,
         "reasons": list(c.reasons),
@@ -105,11 +107,6 @@ def _plain(c: Calibration, arrays: bytes) -> dict[str, Any]:
         "made": c.made,
         "effects": c.effects,
     }
-
-
-def _lists(group: ParameterGroup | Plane) -> dict[str, Any]:
-    plain = {f.name: getattr(group, f.name) for f in dataclasses.fields(group)}
-    return {name: v.tolist() if isinstance(v, np.ndarray) else v for name, v in plain.items()}
 
 
 def _plain_cross_validation(cross_validation: CrossValidation) -> dict[str, Any]:
@@ -231,8 +228,9 @@ def _tuples(plain: dict[str, Any]) -> dict[str, Any]:
 
 def _group(plain: dict[str, Any]) -> ParameterGroup:
     fields = dict(plain)
-    for name in ("value", "std_formal", "std", "factor", "std_imu"):
+    for name in ("value", "std_formal", "std", "factor"):
         fields[name] = None if plain[name] is None else np.array(plain[name], dtype=np.float64)
+    fields["std_by"] = {source: np.array(part, dtype=np.float64) for source, part in plain["std_by"].items()}
     for name in ("labels", "verdict", "columns"):
         fields[name] = None if plain[name] is None else tuple(plain[name])
     return ParameterGroup(**fields)
@@ -255,7 +253,7 @@ def _check(c: Calibration) -> None:
             raise ValueError(f"{g.sensor}.{g.name} holds a value that is no number, or too large")
         size = len(g.labels)
         sizes = {len(g.std), len(g.std_formal), len(g.verdict), size}
-        sizes |= {len(x) for x in (g.columns, g.factor) if x is not None}
+        sizes |= {len(x) for x in (g.columns, g.factor, *g.std_by.values()) if x is not None}
         if sizes != {size} or (g.columns is not None and not all(0 <= k < n for k in g.columns)):
             raise ValueError(f"{g.sensor}.{g.name} does not have {size} entries throughout")
     if not any(s.get("type") in ("imu", "camera", "lidar", "pose") for s in c.rig["sensors"].values()):

@@ -164,7 +164,7 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
             prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
             yield Remark(
                 "imu_prior_limits",
-                f"{_listed(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
+                f"{named_few(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
                 f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial` or "
                 "`intrinsics: tactical`), or "
                 "`intrinsics: fixed` if it is calibrated.",
@@ -174,7 +174,7 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
             meaning = _MEANINGS[verdict]
-            yield meaning.with_sentence(f"{_listed(names)}: {meaning.format(more=_more(c))}.")
+            yield meaning.with_sentence(f"{named_few(names)}: {meaning.format(more=_more(c))}.")
 
 
 def _more(c: Calibration) -> str:
@@ -200,7 +200,7 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0], False
             continue
         unit, scale = display_unit(g.unit)
-        by_imu = np.zeros(len(g.std)) if g.std_imu is None else g.std_imu
+        by_imu = g.std_by.get(f"{c.imu}.intrinsics", np.zeros(len(g.std)))
         for label, verdict, std, part in zip(g.labels, verdicts, g.std.tolist(), by_imu.tolist(), strict=False):
             name = f"{g.sensor} {g.name if label in (g.name, '') else f'{g.name} {label}'}".replace("_", " ")
             is_most = part**2 > _MOST_BY_IMU * std**2
@@ -208,6 +208,7 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
             yield f"{name} ({size.strip()})", verdict, is_most
 
 
-def _listed(names: list[str]) -> str:
+def named_few(names: list[str]) -> str:
+    """The first of `names`, and how many more there are."""
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return ", ".join(names[:MOST_NAMED]) + more

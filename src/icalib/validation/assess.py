@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
 from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, effects_left_out
 from icalib.optim.arrowhead import restricted_inverse
-from icalib.optim.state import Block, State
+from icalib.optim.state import Block, Key, State
 from icalib.result import (
     Calibration,
     CrossValidation,
@@ -48,9 +48,10 @@ from icalib.result import (
     by_key,
 )
 from icalib.result.calibration import Timeline, row_record, versions
-from icalib.result.verdict import AUXILIARY, failure_words
+from icalib.result.verdict import AUXILIARY, failure_words, named_few
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
+from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import CLOCK_RATE, MOUNTED_NAMES
 from icalib.validation.causes import all_causes, pace_words, scatter_warnings
 from icalib.validation.guesses import guess_notes
@@ -67,9 +68,13 @@ def assess(
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
     contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
     changes = [change for _, change in contradicting]
-    determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, left_out.shifts, *changes]))
+    shifts = [determined.shifts, *left_out.shifts.values(), *changes]
+    determined = dataclasses.replace(determined, shifts=np.vstack(shifts))
     observability = _observed(inputs, determined, _column_names(inputs))
-    groups = _groups(inputs, determined, observability, VarianceParts.of(determined, segments))
+    variances = VarianceParts.of(determined, segments)
+    unseen = {key: shift**2 for key, shift in left_out.shifts.items()}
+    unseen |= {key: variances.weight**2 * v for key, v in determined.prior_variances.items()}
+    groups = _groups(inputs, determined, observability, variances, unseen)
     validation = cross_validation(segments, [s for s in (rig.reference,) if _is_assumed(inputs, s)])
     timeline = Timeline.of(inputs.parts, _keyframe_instants(inputs, estimate.outcome.state), rig.reference)
     factors = _factors(inputs, groups)
@@ -204,13 +209,14 @@ def _raw_value(inputs: Inputs, state: State, block: Block) -> np.ndarray:
 
 
 def _groups(
-    inputs: Inputs, determined: Determined, observability: Observability, variances: VarianceParts
-) -> tuple[ParameterGroup, ...]:
-    """The parameter groups of the result, fixed ones included. `variances` gives the empirical factors."""
+    inputs: Inputs, determined: Determined, observability: Observability, variances: VarianceParts,
+    unseen: Mapping[Key, np.ndarray],
+) -> tuple[ParameterGroup, ...]:  # fmt: skip
+    """The parameter groups of the result, fixed ones included. `variances` gives the empirical factors; unseen: (B,)
+    parts of the variances that come from nuisance parameters and effects, by group."""
     formal, problem = np.sqrt(np.diag(observability.covariance)), determined.estimate.problem
     overall = variances.pooled(calibration_columns(inputs))
     state = determined.estimate.outcome.state
-    by_imu = variances.weight * np.sqrt(np.maximum(determined.prior_variance(inputs.rig.reference), 0.0))
     groups = []
     for block in inputs.layout.blocks:
         if block.name in IN_THE_WORLD or _is_assumed(inputs, block.sensor):
@@ -225,7 +231,8 @@ def _groups(
         std, factor = formal[k], variances.factor(k, overall)
         sizes = factor * np.maximum(observability.spread[k], std / problem.tolerance[k])
         group = _group(inputs, block, state, std, factor, observability.verdicts(k, sizes))
-        groups.append(dataclasses.replace(group, std_imu=by_imu[k]))
+        by = {f"{sensor}.{name}": np.sqrt(np.maximum(v[k], 0.0)) for (sensor, name), v in unseen.items()}
+        groups.append(dataclasses.replace(group, std_by=by))
     return tuple(groups)
 
 
@@ -344,6 +351,7 @@ def notes(assessed: AssessedEstimate) -> Iterator[Remark]:
         yield Remark("recording_span", f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}.")
     yield from assessed.inputs.measurements.notes
     yield from _clock_rate_notes(assessed)
+    yield from unseen_notes(assessed.groups)
     for assessment in assessments(assessed):
         yield from assessment.notes
 
@@ -362,6 +370,28 @@ def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
                 f"{1e3 * drift_s:.2g} ms over the recording; the estimate includes it as clock_rate."
             )
             yield Remark("clock_rate_estimated", sentence)
+
+
+MOST_OF_VARIANCE = 0.5  # share from which on a note names its source
+
+
+def unseen_notes(groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
+    """A note on each nuisance parameter or effect that makes up most of the variance of a value."""
+    named = dict[str, list[str]]()
+    for g in groups:
+        unit, scale = display_unit(g.unit)
+        for source, part in g.std_by.items() if g.mode != "prior" and g.name not in AUXILIARY else ():
+            for k in np.flatnonzero(part**2 > MOST_OF_VARIANCE * g.std**2):
+                value = f"{g.sensor} {g.name} {'' if g.labels[k] == g.name else g.labels[k]}".replace("_", " ").strip()
+                size = f"{scale * part[k]:.2g} of {scale * g.std[k]:.2g} {unit}".strip()
+                named.setdefault(source, []).append(f"{value} ({size})")
+    for source, values in named.items():
+        sensor, name = source.split(".")
+        yield Remark(
+            "std_from_prior",
+            f"the recording hardly shows the {name.replace('_', ' ')} of {sensor}, which makes up most of the standard "
+            f"deviation of {named_few(values)}; state a smaller sigma where you know it better.",
+        )
 
 
 # Two-fold cross-validation, in the form of the result.
@@ -422,7 +452,7 @@ class VarianceParts(NamedTuple):
         split."""
         estimate = determined.estimate
         variance, guess = np.diag(determined.covariance), (determined.shifts**2).sum(axis=0)
-        prior = np.clip(determined.prior_variance(), 0.0, variance - guess)
+        prior = np.clip(sum(determined.prior_variances.values(), np.zeros(len(variance))), 0.0, variance - guess)
         formal = noise_variance(estimate.problem, estimate.outcome)
         empirical = _empirical_variance(estimate, segments, formal)
         ratio = np.sqrt(np.divide(empirical, formal, out=np.ones_like(formal), where=formal > 0.0))  # 0: fixed
