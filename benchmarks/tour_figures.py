@@ -37,9 +37,9 @@ class Figure:
 
 FIGURES_OF_THE_PAGE = (
     Figure("trust", "out-published", "trust"),
-    Figure("corners", "out-published", "images", "#images > :nth-child(n + 5), #time-0"),
-    Figure("corners-lens", "out", "images", "#images > :nth-child(n + 5), #time-0"),
-    Figure("jump", "out-jump", "images", "#images > p, #plane-0, #image-0, #plane-1, #image-1"),
+    Figure("corners", "out-published", "images", "#images > :nth-child(n + 5), figure:has(#time-0)"),
+    Figure("corners-lens", "out", "images", "#images > :nth-child(n + 5), figure:has(#time-0)"),
+    Figure("jump", "out-jump", "images", "#images > p, figure:has(:is(#plane-0, #image-0, #plane-1, #image-1))"),
 )
 
 
@@ -57,8 +57,8 @@ def main() -> None:
 
 def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
     """Write the part of `report` that `figure` says."""
-    hidden = f"header, main > section:not(#{figure.section}){', ' + figure.hidden if figure.hidden else ''}"
-    style = f"<style>body {{ background: #fff; }} {hidden} {{ display: none !important; }}</style></head>"
+    hidden = f"header, nav, main > section:not(#{figure.section}){', ' + figure.hidden if figure.hidden else ''}"
+    style = f"<style>body {{ background: #fff; display: block; }} {hidden} {{ display: none !important; }}</style></head>"
     with tempfile.TemporaryDirectory() as scratch:
         page, shot = Path(scratch) / "page.html", Path(scratch) / "shot.png"
         page.write_text(report.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
