@@ -58,7 +58,9 @@ def main() -> None:
 def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
     """Write the part of `report` that `figure` says."""
     hidden = f"header, nav, main > section:not(#{figure.section}){', ' + figure.hidden if figure.hidden else ''}"
-    style = f"<style>body {{ background: #fff; display: block; }} {hidden} {{ display: none !important; }}</style></head>"
+    style = (
+        f"<style>body {{ background: #fff; display: block; }} {hidden} {{ display: none !important; }}</style></head>"
+    )
     with tempfile.TemporaryDirectory() as scratch:
         page, shot = Path(scratch) / "page.html", Path(scratch) / "shot.png"
         page.write_text(report.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")

@@ -150,6 +150,7 @@ def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
     target = "YAML of the target, or a rig file: search the images for this target; default: not searched"
     c.add_argument("--target", type=file_path, metavar="FILE", help=target)
     c.add_argument("--json", type=file_path, metavar="FILE", help="write the results of the inspection as JSON")
+    c.add_argument("--html", type=file_path, metavar="FILE", help="write them as a page with plots and images")
     add_part(c)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
     c.set_defaults(run=_inspect)
@@ -319,20 +320,19 @@ def _fleet(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> None:
-    from icalib.base.files import refuse_existing, refuse_foreign, write_new, write_sealed
+    from icalib.base.files import printable, refuse_existing, refuse_foreign, write_new, write_sealed
     from icalib.cli.console import console_progress
     from icalib.tools.inspection import draft_rig, inspect_recording, read_target
-    from icalib.tools.inspection.console import figures_json, print_inspection
+    from icalib.tools.inspection.console import figures_json, inspection_html, print_inspection
 
     if options.rig:
         advice = "give another name for the draft, or give it as --target to use the target in it"
         refuse_existing(options.rig, advice)
-    if options.json:
-        if not options.json.parent.is_dir():
-            raise CalibrationError(
-                f"{options.json} cannot be written (its folder does not exist); choose another place."
-            )
-        refuse_foreign([options.json], [p for p in (options.recording, options.target) if p], "choose another place")
+    written = [path for path in (options.json, options.html) if path]
+    for path in written:
+        if not path.parent.is_dir():
+            raise CalibrationError(f"{path} cannot be written (its folder does not exist); choose another place.")
+    refuse_foreign(written, [p for p in (options.recording, options.target) if p], "choose another place")
     target = read_target(options.target) if options.target else None
     with console_progress(options.quiet) as progress:
         inspection = inspect_recording(
@@ -342,6 +342,8 @@ def _inspect(options: argparse.Namespace) -> None:
         print_inspection(inspection)
     if options.json:
         write_sealed(options.json, figures_json(inspection))
+    if options.html:
+        write_sealed(options.html, printable(inspection_html(inspection)))
     if options.rig:
         write_new(options.rig, draft_rig(inspection))
         if not options.quiet:

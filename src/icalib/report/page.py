@@ -129,7 +129,7 @@ def _templates() -> Environment:
     return env
 
 
-def document(template: str, plots: Iterable[Plot], **values: object) -> str:
+def document(template: str, plots: Iterable[Plot], /, **values: object) -> str:
     """One HTML file, plotly.js included, from a template of the package, such as "report/page.html". plots: those that
     it shows; values: what else it names. Text is escaped."""
     return (

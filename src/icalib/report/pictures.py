@@ -121,17 +121,20 @@ def _corners(c: Calibration, picture: ReportImage, width: int) -> tuple[list[Lin
     uv, residual = r.uv[rows], r.residual[rows].astype(np.float64)
     gain = _gain(residual[has_residual & ~rejected], width)
     s = MARK_SHARE * width
-    square = f"h{2 * s:.1f}v{2 * s:.1f}h{-2 * s:.1f}z"
     cross = f"l{2 * s:.1f} {2 * s:.1f}m{-2 * s:.1f} 0l{2 * s:.1f} {-2 * s:.1f}"
-    squares, crosses = (
-        "".join(f"M{u:.1f} {v:.1f}{mark}" for u, v in uv[chosen] - s)
-        for mark, chosen in ((square, ~rejected), (cross, rejected))
-    )
+    crosses = "".join(f"M{u:.1f} {v:.1f}{cross}" for u, v in uv[rejected] - s)
     ends = zip(uv[has_residual], gain * residual[has_residual], strict=True)
     arrows = "".join(f"M{u:.1f} {v:.1f}l{du:.1f} {dv:.1f}" for (u, v), (du, dv) in ends)
-    drawn = [Line("measured", squares), Line("residual", arrows), Line("rejected", crosses)]
+    drawn = [squares(uv[~rejected], width), Line("residual", arrows), Line("rejected", crosses)]
     count = f"{(~rejected).sum()} {r.kind}" + (f", {rejected.sum()} rejected" if rejected.any() else "")
     return drawn, f"{count}; residuals are {gain:g} times as long"
+
+
+def squares(uv: np.ndarray, width: int) -> Line:
+    """Squares about points (n, 2) of an image of this width [px]."""
+    s = MARK_SHARE * width
+    square = f"h{2 * s:.1f}v{2 * s:.1f}h{-2 * s:.1f}z"
+    return Line("measured", "".join(f"M{u:.1f} {v:.1f}{square}" for u, v in uv - s))
 
 
 def _gain(residual: np.ndarray, width: int) -> float:

@@ -83,6 +83,25 @@ class TestTarget:
         assert "cam0 has 10 images, too few" in shown
         assert "6 (60%)" in shown and "never sees the target at the" in shown and "right edge" in shown
 
+    def test_a_page_shows_it(self, bag, tmp_path, assert_drawn):
+        out = tmp_path / "page.html"
+        given = [
+            "--target",
+            str(tmp_path / "target.yaml"),
+            "--html",
+            str(out),
+            "--json",
+            str(tmp_path / "f.json"),
+            "-q",
+        ]
+        assert main(["inspect", str(bag), *given]) == 0
+        page = out.read_text()
+        assert "No." in page and "cam0 has 10 images, too few" in page and "6 (60%)" in page
+        assert page.count("data:image/jpeg") == page.count("cam0: 36 corners of the target") == 3
+        assert_drawn(page, {"coverage-cam0", "motion-imu0"})
+        figures = json.loads((tmp_path / "f.json").read_text())
+        assert "curves" not in figures["imus"]["imu0"] and "images_seen" not in figures["cameras"]["cam0"]["target"]
+
     def test_the_target_of_a_rig_file_or_of_kalibr(self, bag, tmp_path, capsys):
         assert main(["inspect", str(bag), "--rig", str(tmp_path / "rig.yaml"), "--quiet"]) == 0
         text = (tmp_path / "rig.yaml").read_text()
@@ -364,7 +383,8 @@ class TestNoRecording:
     def test_an_empty_bag(self, bags, tmp_path, capsys):
         assert "run" in self.refusal(bags.write(tmp_path / "run", []), capsys)
 
-    def test_json_that_cannot_be_written(self, bags, brief, tmp_path, capsys):
+    @pytest.mark.parametrize("kind", ["json", "html"])
+    def test_files_that_cannot_be_written(self, kind, bags, brief, tmp_path, capsys):
         bag = bags.write(tmp_path / "run", bags.noise("/cam0/image_raw") + bags.imu("/imu0", brief))
-        assert main(["inspect", str(bag), "--json", str(tmp_path / "away" / "f.json"), "-q"]) == 1
-        assert "f.json cannot be written" in capsys.readouterr().err
+        assert main(["inspect", str(bag), f"--{kind}", str(tmp_path / "away" / f"f.{kind}"), "-q"]) == 1
+        assert f"f.{kind} cannot be written" in capsys.readouterr().err

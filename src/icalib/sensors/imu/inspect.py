@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -19,6 +19,9 @@ from icalib.data.recordings import Recording, TopicInfo
 from icalib.data.stamps import ClockJumps
 from icalib.errors import RecordingError
 from icalib.motion.imu_data import axis_words, other_axes
+from icalib.report.figures import MOST_ROWS, stacked_panels, thin
+from icalib.report.page import Plot
+from icalib.report.pictures import Drawing
 from icalib.sensors.imu.assess import quiet_scatter
 from icalib.sensors.imu.read import CARRIED, Saturation, checked_imu, one_stream, pair_of, readings, saturations
 from icalib.sensors.imu.read.cleaning import gravity_spread
@@ -34,6 +37,7 @@ from icalib.sensors.imu.spec import (
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.console import plain_table
 from icalib.tools.inspection.facts import (
+    PICTURED,
     Draft,
     Facts,
     Finding,
@@ -74,7 +78,8 @@ class ImuFacts:
     frame: frame id. mean_accel: mean of |accel|. gyro_rms: RMS of each axis; accel_std: RMS about the mean.
     principal_rms: RMS rate about the directions `principal` (unit vectors), largest first. gravity_spread: result of
     `gravity_turns.gravity_spread` for rates taken as rad/s, as deg/s, and as zero. scatter: `quiet_scatter` of
-    gyro and accel. problem: why `calibrate` would refuse the readings, else "".
+    gyro and accel. problem: why `calibrate` would refuse the readings, else "". curves: seconds (n,), gyro and
+    accel (n, 3) of some readings, evenly picked.
     """
 
     frame: str
@@ -92,6 +97,7 @@ class ImuFacts:
     saturated: tuple[Saturation, ...]
     notes: tuple[str, ...]
     problem: str = ""
+    curves: tuple[np.ndarray, np.ndarray, np.ndarray] | None = field(default=None, metadata=PICTURED)
 
 
 @dataclass(frozen=True)
@@ -248,6 +254,16 @@ class ImuInspector(KindInspector):
         facts = {name: inspection.facts[name] for name in imus if inspection.facts[name] is not None}
         return Printout(readings=[imu_table(facts)] if facts else [])
 
+    def pictures(self, inspection: Inspection) -> tuple[list[Plot], list[Drawing]]:
+        """Rates and specific forces over time."""
+        titles, plots = ("rate [deg/s]", "specific force [m/s^2]"), []
+        for name in inspection.sources.of(self.sensor.sensor_type):
+            if inspection.facts[name] is not None and (curves := inspection.facts[name].curves):
+                seconds, gyro, accel = curves
+                motion = stacked_panels([(seconds, gyro / DEGREE), (seconds, accel)], titles, 380)
+                plots.append(Plot(f"motion-{name}", motion, f"{name}: motion in its axes x, y, z"))
+        return plots, []
+
 
 INSPECTOR = ImuInspector()
 
@@ -374,6 +390,7 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         problem = str(error)
     finite = np.isfinite(imu.gyro).all(axis=1) & np.isfinite(imu.accel).all(axis=1)
     gyro, accel = (x[finite] if finite.any() else np.zeros((1, 3)) for x in (imu.gyro, imu.accel))
+    some = thin(len(gyro), MOST_ROWS)
     # eigh sorts in ascending order; here the strongest direction comes first.
     squares, directions = np.linalg.eigh(gyro.T @ gyro / len(gyro))
     first, second, third = (_vector(d * np.sign(d[np.argmax(np.abs(d))])) for d in directions.T[::-1])
@@ -395,6 +412,7 @@ def imu_facts(imu: ImuStream, where: str, frame: str, notes: tuple[str, ...] = (
         saturated=saturations(imu) if finite.all() and len(imu.gyro) else (),
         notes=notes,
         problem=problem,
+        curves=(imu.seconds[finite][some], gyro[some], accel[some]) if finite.any() else None,
     )
 
 

@@ -56,7 +56,7 @@ def allan_html(study: ImuNoiseStudy) -> str:
         rows=[cells for sensor in study.sensors for cells in rows(sensor)],
         snippet=rig_snippet(study),
         study=study,
-        plots_of_sensors=plots,
+        plots=plots,
     )
 
 

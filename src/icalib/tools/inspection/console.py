@@ -1,11 +1,12 @@
 """Prints an inspection on the terminal: first whether the recording can be calibrated, then the figures.
 
-Figures of an inspection as plain data and JSON, in SI units.
+The same as a page with plots and images. Figures of an inspection as plain data and JSON, in SI units.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.text import Text
 from icalib.base.files import json_text
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
+from icalib.report.page import document
 from icalib.tools.inspection.facts import Inspection, StreamFacts, named, plain
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
@@ -31,8 +33,7 @@ _UNSEEN = Text("Yes, as far as can be told without searching images for the targ
 def print_inspection(inspection: Inspection, console: Console | None = None) -> None:
     """Prints on `console`, by default on standard output."""
     out = console or Console()
-    answer = _UNSEEN if inspection.verdict == "yes" and inspection.target is None else _ANSWERS[inspection.verdict]
-    out.print(Text("Can this be calibrated? ", style="bold") + answer)
+    out.print(Text("Can this be calibrated? ", style="bold") + _answer(inspection))
     for f in inspection.findings:
         out.print(Text(f"  {f.severity}: ", style=STYLES[f.severity]) + Text(f.sentence))
     out.print()
@@ -44,6 +45,38 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
         _print_table(table, out)
     for note in (*inspection.notes, *(note for kind in printouts for note in kind.notes)):
         out.print(Text(f"Note: {note}"))
+
+
+def _answer(inspection: Inspection) -> Text:
+    return _UNSEEN if inspection.verdict == "yes" and inspection.target is None else _ANSWERS[inspection.verdict]
+
+
+def inspection_html(inspection: Inspection) -> str:
+    """The inspection as one HTML document."""
+    kinds = inspectors().values()
+    printouts, pictures = [k.printout(inspection) for k in kinds], [k.pictures(inspection) for k in kinds]
+    tables = [t for p in printouts for t in (*p.readings, *p.target) if isinstance(t, Table)]
+    plots = [plot for of_kind, _ in pictures for plot in of_kind]
+    return document(
+        "tools/inspection/page.html",
+        plots,
+        title=f"Recording {Path(inspection.recording).name}",
+        answer=str(_answer(inspection)),
+        trust={"yes": "good", "yes, but": "care", "no": "bad"}[inspection.verdict],
+        inspection=inspection,
+        streams=_plain_table(streams_table(inspection)),
+        tables=[_plain_table(t) for t in tables],
+        notes=[*inspection.notes, *(note for p in printouts for note in p.notes)],
+        plots=plots,
+        drawings=[drawing for _, of_kind in pictures for drawing in of_kind],
+    )
+
+
+def _plain_table(table: Table) -> dict[str, Any]:
+    """Title, headers, rows and caption of a table of the terminal."""
+    rows = list(zip(*(map(str, column.cells) for column in table.columns), strict=True))
+    headers = [str(column.header) for column in table.columns]
+    return {"title": str(table.title or ""), "headers": headers, "rows": rows, "caption": str(table.caption or "")}
 
 
 def _print_table(table: Table | Text, out: Console) -> None:

@@ -28,6 +28,8 @@ from icalib.data.tables import table_files
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.kinds import inspectors
+from icalib.report.page import Plot
+from icalib.report.pictures import Drawing
 from icalib.sensors.sensor import Sensor
 from icalib.tools.inspection.kalibr import KalibrFiles
 
@@ -325,6 +327,10 @@ class KindInspector:
             for line in (f"{name}:", *(f"  {line}" for line in fields)):
                 yield f"  {'' if is_active else '# '}{line}"
 
+    def pictures(self, inspection: Inspection) -> tuple[list[Plot], list[Drawing]]:
+        """Plots and images that the page shows."""
+        return [], []
+
     def lines(self, inspection: Inspection, name: str, topic: TopicInfo) -> Iterator[str]:
         """Lines of the sensor in a rig file, except its type and its topic or path."""
         yield from ()
@@ -423,11 +429,16 @@ def nouns(alone: bool = False) -> str:
     return " or ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
 
 
+PICTURED = {"pictured": True}  # metadata of fields that only the page shows
+
+
 def plain(value: Any) -> dict[str, Any]:
-    """The fields of a dataclass, arrays as lists; {} for None."""
+    """The fields of a dataclass, arrays as lists, without those in metadata `PICTURED`; {} for None."""
     if value is None:
         return {}
-    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in dataclasses.asdict(value).items()}
+    left_out = {f.name for f in dataclasses.fields(value) if f.metadata == PICTURED}
+    entries = {k: v for k, v in dataclasses.asdict(value).items() if k not in left_out}
+    return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in entries.items()}
 
 
 _PLAIN = re.compile(r"[A-Za-z0-9_./][A-Za-z0-9_./-]*")

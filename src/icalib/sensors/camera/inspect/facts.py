@@ -26,6 +26,7 @@ from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.sensors.camera.spec import Camera
 from icalib.tools.inspection.facts import (
+    PICTURED,
     Inspection,
     SensorSource,
     StreamFacts,
@@ -62,7 +63,7 @@ class TargetView:
     distance_ratio: 90th over 10th percentile of the distance. Both are rough, as the intrinsics are unknown. model:
     camera model that fits the corners, None if they are too few; errors_px: of the models compared, see
     `fitting_model`. stops: places at which the target was at rest; None if images do not
-    follow one another.
+    follow one another. images_seen: JPEG and corners (n, 2) px of some images, those with most corners first.
     """
 
     camera: str
@@ -77,6 +78,7 @@ class TargetView:
     model: str | None = None
     errors_px: Mapping[str, float] = field(default_factory=dict)
     stops: int | None = None
+    images_seen: tuple[tuple[bytes, np.ndarray], ...] = field(default=(), metadata=PICTURED)
 
 
 @dataclass(frozen=True)
@@ -127,6 +129,7 @@ def without_target(inspection: Inspection) -> bool:
     return bool(inspection.imu and words) and not any(words.values())
 
 
+PICTURES, PICTURES_SHOWN = 12, 3  # images that are kept of each camera, evenly spread, and those that a page shows
 SAMPLE = 16  # images per camera that are decoded, spread over the recording
 
 
@@ -213,7 +216,7 @@ def target_view(
         if tabled:
             corners, notes = recorded_corners(recording, camera, target), ()
         else:
-            corners, notes = find_corners(recording, camera, target, progress=progress)
+            corners, notes = find_corners(recording, camera, target, progress=progress, pictures=PICTURES)
     except RecordingError as error:
         return TargetView(name, None, 0, 0, None, None, None, problem=str(error))
     count = np.diff(corners.start)
@@ -233,7 +236,14 @@ def target_view(
         model=model,
         errors_px=errors_px,
         stops=len(common_stops([view])) if follow_closely(view[0]) else None,
+        images_seen=_images_seen(corners),
     )
+
+
+def _images_seen(corners: CornerStream) -> tuple[tuple[bytes, np.ndarray], ...]:
+    jpegs = [(corners.pictures[ns][1], k) for k, ns in enumerate(corners.stamps_ns.tolist()) if ns in corners.pictures]
+    seen = [(jpeg, corners.uv[corners.start[k] : corners.start[k + 1]]) for jpeg, k in jpegs]
+    return tuple(sorted(seen, key=lambda image: -len(image[1]))[:PICTURES_SHOWN])
 
 
 def target_in(images: Iterable[np.ndarray]) -> str:
