@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from array import array
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -35,6 +36,7 @@ class BagRecording(Recording):
         self._storages, self._notes = open_storages(root)
         self._topics = self._list_topics()
         self._received = self._received_ns()
+        self._times: dict[TopicInfo, array[int]] = {}
 
     def _received_ns(self) -> Span:
         """Range of receive times [ns] of the messages in the time window, by the clock of the recorder. Raises
@@ -98,6 +100,7 @@ class BagRecording(Recording):
     ) -> Iterator[tuple[int, Any]]:
         total = unstamped = 0
         damaged: list[tuple[int, ValueError]] = []
+        times = array("q")
         for received_ns, encoding, content in self._contents(topic):
             if encoding not in _stores():
                 raise RecordingError(
@@ -117,7 +120,9 @@ class BagRecording(Recording):
             stamp = message.header.stamp
             stamp_ns = stamp.sec * 1_000_000_000 + stamp.nanosec
             unstamped += not stamp_ns
+            times.extend((stamp_ns or received_ns, received_ns))
             yield stamp_ns or received_ns, converted
+        self._times[topic] = times
         if damaged:
             self._note_damage(topic.name, damaged, total)
         if unstamped:
@@ -158,6 +163,9 @@ class BagRecording(Recording):
         if not is_any_inside and topic.count and topic.first_ns is not None and topic.last_ns is not None:
             origin = min(first for first, _ in self._spans())
             raise self.window.refuse(f"{self.root} {topic.name}", (topic.last_ns - origin) * 1e-9)
+
+    def received(self, topic: TopicInfo) -> np.ndarray:
+        return np.array(self._times.get(topic, ()), np.int64).reshape(-1, 2)
 
     def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
         """(N,) indices that sort readings by stamp, with a note. No change if a reading is late by more than 1 s: the

@@ -79,6 +79,11 @@ class Recording(ABC):
         """
         raise RecordingError(f"{self.root} holds no messages, and {topic} should have some of {kind}; give a bag.")
 
+    def received(self, topic: TopicInfo) -> np.ndarray:
+        """(N, 2) int64 ns: stamp and receive time of each message, once all messages of the topic were read. This
+        default, for recordings without receive times, is empty."""
+        return np.zeros((0, 2), np.int64)
+
     def by_stamp(self, topic: str, stamps_ns: np.ndarray) -> np.ndarray:
         """(N,) indices that sort readings by stamp, with a note. This default, for formats with sorted data, changes
         nothing."""

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Reader
 
-from icalib.tools.inspection.facts import overlap_s, timing_of
+from icalib.cli import main
+from icalib.tools.inspection import inspect_recording
+from icalib.tools.inspection.facts import clock_rate_of, overlap_s, timing_of
 
 STEP = 50_000_000
 
@@ -55,3 +61,63 @@ def test_overlap():
     assert a and b and c
     assert overlap_s(a, b) == pytest.approx(0.3) == overlap_s(b, a)
     assert overlap_s(a, c) == pytest.approx(-1.0)
+
+
+def received(stamps_ns: np.ndarray, rate_ppm: float, delay_s: np.ndarray) -> np.ndarray:
+    """(N, 2) stamps of a clock with that rate, and when the messages arrive."""
+    since = stamps_ns - stamps_ns[:1]
+    return np.stack([stamps_ns, stamps_ns + np.round(1e-6 * rate_ppm * since + 1e9 * delay_s).astype(np.int64)], axis=1)
+
+
+LATE: dict[str, Callable[[np.random.Generator, int], np.ndarray]] = {
+    "queued": lambda rng, n: rng.exponential(2e-3, n),
+    "bursts": lambda rng, n: rng.exponential(2e-4, n) + 0.05 * (rng.random(n) < 0.1),
+    "scheduled": lambda rng, n: 5e-3 + np.abs(rng.normal(scale=1e-3, size=n)),
+}
+
+
+@pytest.mark.parametrize("late", LATE)
+def test_rate_of_a_clock_by_receive_times(late):
+    """40 seeds; the tenth part of the least delays is some us of 60 s, and sigma has 8 degrees of freedom."""
+    z = []
+    for seed in range(40):
+        delay = LATE[late](np.random.default_rng(seed), 1200)
+        rate = clock_rate_of(received(1_700_000_000_000_000_001 + STEP * np.arange(1200), -35.0, delay))
+        assert rate is not None and rate.std_ppm < 1.0 and rate.duration_s == pytest.approx(59.95)
+        z.append((rate.ppm + 35.0) / rate.std_ppm)
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.7 and np.abs(z).max() < 6.0
+
+
+def test_rate_of_the_longest_part_of_a_clock_that_jumps():
+    times = received(STEP * np.arange(400), 20.0, np.zeros(400))
+    times[300:, 0] += 10**13
+    rate = clock_rate_of(times)
+    assert rate is not None and rate.ppm == pytest.approx(20.0) and rate.duration_s == pytest.approx(14.95)
+
+
+@pytest.mark.parametrize("n, step", [(0, STEP), (49, STEP), (100, 0)])
+def test_too_few_messages_for_the_rate_of_a_clock(n, step):
+    assert clock_rate_of(received(7 + step * np.arange(n), 0.0, np.zeros(n))) is None
+
+
+def test_a_bag_tells_the_rates_of_its_clocks(tmp_path, monkeypatch):
+    """A simulated bag: the pose sensor's clock is 80 ppm slow, and that of the IMU is the recorder's."""
+    monkeypatch.chdir(tmp_path)
+    place, noise = "[[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]", "gyro: 1e-4, gyro_walk: 1e-5"
+    (tmp_path / "scenario.yaml").write_text(
+        "duration: 10\nmotion: {kind: free}\nroom: {size: [10, 8, 4]}\nsensors:\n"
+        f"  imu0: {{type: imu, rate: 100, noise: {{{noise}, accel: 1e-3, accel_walk: 1e-4}}}}\n"
+        f"  mocap: {{type: pose, T_imu_sensor: {place}, rate: 50, time_offset: 0.01, clock_rate: 80}}\n"
+    )
+    assert main(["simulate", "scenario.yaml", "-o", "run.bag", "--level", "sensor", "-q"]) == 0
+    with Reader(tmp_path / "run.bag") as bag:
+        poses = [received_ns for c, received_ns, _ in bag.messages() if c.topic == "/mocap/pose"]
+    assert np.ptp(np.diff(poses)) < 100  # even on the clock of the recorder, to the rounding of stamps
+    assert main(["inspect", "run.bag", "--json", "found.json", "-q"]) == 0
+    rates = {t["name"]: t["clock_rate"] for t in json.loads((tmp_path / "found.json").read_text())["topics"]}
+    assert rates["/imu0"]["ppm"] == 0.0 and rates["/mocap/pose"]["ppm"] == pytest.approx(80.0, abs=1e-3)
+    hints = [f.sentence for f in inspect_recording("run.bag").findings if "receive times" in f.sentence]
+    assert len(hints) == 1 and hints[0].startswith("/mocap/pose: header stamps run 80 +- ")
+    assert "slow against receive times, 0.79 ms over the recording" in hints[0]
+    inside = inspect_recording("run.bag", start_s=2.0, end_s=6.0)
+    assert [s.clock_rate.duration_s for s in inside.streams if s.clock_rate] == pytest.approx([3.99, 3.98], abs=0.02)

@@ -30,6 +30,7 @@ from icalib.tools.inspection.facts import (
     Progress,
     Sources,
     StreamFacts,
+    clock_rate_of,
     comment,
     findings,
     independent,
@@ -109,7 +110,8 @@ def _read(
     for k, topic in enumerate([t for t in topics if t not in read], len(read)):
         progress(f"reading {topic.name}", k / len(topics))
         read[topic] = _read_stamps(recording, topic, topic.name in sources.left_out)
-    return tuple(read[topic] for topic in topics), facts
+    clocks = {topic: clock_rate_of(recording.received(topic)) for topic in topics}
+    return tuple(dataclasses.replace(read[topic], clock_rate=clocks[topic]) for topic in topics), facts
 
 
 def _read_stamps(recording: Recording, topic: TopicInfo, left_out: bool) -> StreamFacts:

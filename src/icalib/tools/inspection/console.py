@@ -180,7 +180,8 @@ def _sensors(inspection: Inspection) -> dict[str, Any]:
 def _stream(stream: StreamFacts) -> dict[str, Any]:
     """One topic: its entry in the index, and the statistics of its stamps."""
     topic = dataclasses.asdict(stream.topic)
-    return topic | {"timing": plain(stream.timing) or None, "problem": stream.problem}
+    figures = {"timing": plain(stream.timing) or None, "clock_rate": plain(stream.clock_rate) or None}
+    return topic | figures | {"problem": stream.problem}
 
 
 def _target(inspection: Inspection) -> dict[str, Any] | None:

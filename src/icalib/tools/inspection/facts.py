@@ -28,6 +28,7 @@ from icalib.data.tables import table_files
 from icalib.errors import RecordingError
 from icalib.geometry.targets import Target
 from icalib.kinds import inspectors
+from icalib.motion.poses import PPM
 from icalib.report.page import Plot
 from icalib.report.pictures import Drawing
 from icalib.sensors.sensor import Sensor
@@ -74,14 +75,26 @@ class Timing:
 
 
 @dataclass(frozen=True)
+class ClockRate:
+    """Rate of the clock of receive times against that of header stamps, less 1, with its standard deviation [ppm]; in
+    duration_s of stamps. Stamps of a clock that runs fast have a negative rate, as in `clock_rate` of a sensor."""
+
+    ppm: float
+    std_ppm: float
+    duration_s: float
+
+
+@dataclass(frozen=True)
 class StreamFacts:
     """One topic. timing: None for topics that icalib does not read; problem: why it cannot be read, else "". content:
-    words on the messages beside their type, such as the resolution of images."""
+    words on the messages beside their type, such as the resolution of images. clock_rate: None without receive
+    times."""
 
     topic: TopicInfo
     timing: Timing | None
     problem: str = ""
     content: str = ""
+    clock_rate: ClockRate | None = None
 
 
 @dataclass(frozen=True)
@@ -230,6 +243,28 @@ def timing_of(stamps_ns: np.ndarray) -> Timing | None:
         repeated=int((steps == 0).sum()),
         jumps=jumps,
     )
+
+
+_CLOCK_PARTS = 10  # of a recording; 8 degrees of freedom, so that a false 5 sigma has a probability of 0.1 %
+_MIN_PART = 5  # messages of which the least delay is taken
+
+
+def clock_rate_of(times_ns: np.ndarray) -> ClockRate | None:
+    """Rate of a clock from stamps and receive times (N, 2) int64 [ns]; None for too few messages.
+
+    Messages are received late, never early. So the line goes through the least delay in each part of the recording
+    (minimum-delay filtering; Zhang, Liu and Xia 2002); the scatter of these delays gives its standard deviation.
+    """
+    times_ns = times_ns[longest_part(times_ns[:, 0])[0]] if len(times_ns) else times_ns
+    seconds = 1e-9 * (times_ns[:, 0] - times_ns[:1, 0])
+    if len(seconds) < _CLOCK_PARTS * _MIN_PART or not np.ptp(seconds) > 0.0:
+        return None
+    delay, line, C = 1e-9 * (times_ns[:, 1] - times_ns[:, 0]), np.zeros(2), np.zeros((2, 2))
+    for _ in range(2):  # the second time without the drift within a part
+        off = delay - np.polyval(line, seconds)
+        least = [part[np.argmin(off[part])] for part in np.array_split(np.arange(len(off)), _CLOCK_PARTS)]
+        line, C = np.polyfit(seconds[least], delay[least], 1, cov=True)
+    return ClockRate(float(line[0] / PPM), float(np.sqrt(C[0, 0]) / PPM), float(np.ptp(seconds)))
 
 
 def overlap_s(a: Timing, b: Timing) -> float:
@@ -493,11 +528,12 @@ def frame_id(recording: Recording, topic: TopicInfo) -> str:
 # of sensors in formats that icalib does not read.
 
 _ORDER = ("problem", "warning", "hint")
+_DRIFT_SIGMAS = 5.0  # standard deviations of a clock rate that is named
 
 
 def findings(inspection: Inspection) -> tuple[Finding, ...]:
     """All findings: problems, then warnings, then hints."""
-    every = [*missing_sensors(inspection), *unread(inspection)]
+    every = [*missing_sensors(inspection), *unread(inspection), *_clock_rates(inspection)]
     for subject in get_args(Subject):
         every += _jumps(inspection) if subject == "gaps" else ()
         for kind in reversed(inspectors().values()):  # first of sensors that are compared with the IMU
@@ -514,6 +550,20 @@ def _jumps(inspection: Inspection) -> Iterator[Finding]:
                 "warning",
                 f"{stream.topic.name}: the clock jumps forward; the longest part between jumps is used, "
                 f"{stream.timing.duration_s:.1f} s, unless --from and --to choose another.",
+            )
+
+
+def _clock_rates(inspection: Inspection) -> Iterator[Finding]:
+    """Hints on header stamps that drift against the receive times."""
+    for stream in inspection.streams:
+        rate = stream.clock_rate
+        if rate is not None and abs(rate.ppm) > _DRIFT_SIGMAS * rate.std_ppm:
+            drift_ms = 1e3 * PPM * abs(rate.ppm) * rate.duration_s
+            yield Finding(
+                "hint",
+                f"{stream.topic.name}: header stamps run {abs(rate.ppm):.3g} +- {rate.std_ppm:.2g} ppm "
+                f"{'fast' if rate.ppm < 0.0 else 'slow'} against receive times, {drift_ms:.2g} ms over the recording; "
+                "`icalib calibrate` estimates rates between clocks as clock_rate.",
             )
 
 

@@ -279,13 +279,14 @@ def _streams(simulation: Simulation, seed: int) -> tuple[dict[str, str], list[It
     measured = simulation.measurements
     assert measured.imu is not None  # of every scenario
     topics, streams, notes = {IMU_TOPIC: IMU}, [_readings(measured.imu)], []
+    middle_ns = simulation.truth.imu_clock_origin_ns + int(0.5e9 * simulation.truth.seconds[-1])
     for sensor in simulation.scenario.sensors:
         topic = _record(simulation, sensor).topic
         if isinstance(topic, str):
             notes.append(topic)
             continue
         topics[topic.name] = topic.message
-        streams.append(_on_topic(topic))
+        streams.append(_on_topic(topic, sensor.clock_rate_ppm, middle_ns))
     if simulation.scenario.board or simulation.scenario.room:
         topics |= {f"/{camera.name}/image_raw": IMAGE for camera in simulation.scenario.cameras}
         streams.append(_images(simulation, seed))
@@ -300,8 +301,9 @@ def _record(simulation: Simulation, sensor: SimSensor) -> SimRecord:
     return sensor.record(simulation.measurements.streams[sensor.name], offset_ns)
 
 
-def _on_topic(topic: BagTopic) -> Iterator[Event]:
-    return ((at_ns, topic.name, make) for at_ns, make in topic.events)
+def _on_topic(topic: BagTopic, rate_ppm: float, middle_ns: int) -> Iterator[Event]:
+    """The events at their instants on the IMU's clock: those of the topic have its time offset, but not its rate."""
+    return ((at_ns + round(1e-6 * rate_ppm * (at_ns - middle_ns)), topic.name, make) for at_ns, make in topic.events)
 
 
 def _readings(imu: ImuStream) -> Iterator[Event]:
