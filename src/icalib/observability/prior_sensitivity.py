@@ -333,6 +333,8 @@ def _linearised(
     Priors on `effects` are so wide that they have no weight."""
     fixed_directions = _in_layout(inputs.layout, estimate.problem.layout, estimate.problem.fixed_directions)
     state = begun(inputs, estimate.outcome.state)
+    zeros = {b.key: np.zeros(b.size) for b in inputs.layout.free if b.kind == "nuisance"}
+    state = replace(state, values=zeros | state.values)
     try:
         problem = estimate.measurement_model.problem(inputs, state, fixed_directions)
         priors = (replace(p, sigma=WIDE * p.sigma) if p.block.key in effects else p for p in problem.priors)
@@ -456,7 +458,7 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     together; none without convergence."""
     specs = _testable(inputs) if estimate.outcome.converged else {}
     freed = _with_effects(inputs, specs)
-    specs = {key: spec for key, spec in specs.items() if freed.layout.is_free(*key)}
+    specs = {key: spec for key, spec in specs.items() if freed.layout.has(*key) and freed.layout.is_free(*key)}
     single = [key for key, spec in specs.items() if spec.size == 1]
     if not specs or (linearised := _linearised(freed, estimate, single)) is None:
         return EffectsLeftOut()
@@ -469,9 +471,10 @@ def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
     rig, layout, out = inputs.rig, inputs.layout, dict[Key, ParameterSpec]()
     for s in rig.sensors.values():
         is_clocked = layout.has(s.name, TIME_OFFSET.name) and layout.is_free(s.name, TIME_OFFSET.name)
-        for spec in s.specs() if s is not rig.imu or not rig.assumes_motion else ():
+        effects = (spec for spec in s.parameters if spec.is_effect)
+        for spec in effects if s is not rig.imu or not rig.assumes_motion else ():
             p: Parameter = getattr(s, spec.name)
-            if spec.is_effect and p.mode == "fixed" and p.value is None and (is_clocked or spec != CLOCK_RATE):
+            if p.mode == "fixed" and p.value is None and (is_clocked or spec != CLOCK_RATE):
                 out[s.name, spec.name] = spec
     return out
 

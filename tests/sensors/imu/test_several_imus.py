@@ -92,6 +92,19 @@ def test_each_axis_of_an_accelerometer_at_a_place_of_its_own(body):
         assert "scale-misalignment-size-effect" in export(found, "kalibr").files["imu.yaml"]
 
 
+@pytest.mark.parametrize("apart_m", [0.0, 0.012])
+def test_axes_at_different_places_are_named_where_the_rig_file_has_them_at_one(apart_m: float):
+    made = scenario(8.0)
+    made = made.with_sensors(replace(made.of(SimImu)[0], size_effect=(0.0, apart_m, 0.0, 0.0, 0.0, -apart_m)))
+    simulation = simulate(replace(made, sensors=made.sensors[:1]), seed=2)
+    rig = rig_for(simulation.scenario)
+    found = calibrate_measurements(rig.with_("settings", segments=8), simulation.measurements)
+    said = [w for w in found.warnings if w.name == "imu_size_effect"]
+    assert [w.split(" of ")[2].split()[0] for w in said] == (["imu1"] if apart_m else [])
+    value, std = (np.array(found.effects["imu1.size_effect"][name]) for name in ("value", "std"))
+    assert (np.abs(value - [0.0, apart_m, 0.0, 0.0, 0.0, -apart_m]) < 4.0 * std).all()
+
+
 def test_errors_are_within_standard_deviations_and_residuals_as_stated(result, recorded):
     assert result.converged
     for name in ("imu1", "imu2"):

@@ -17,7 +17,7 @@ from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.mounted_factor import SPEED_SIGMA_M_S
-from icalib.sensors.imu.spec import INTRINSICS, INTRINSICS_LABELS, prior_words
+from icalib.sensors.imu.spec import INTRINSICS, INTRINSICS_LABELS, SIZE_EFFECT, prior_words
 from icalib.sensors.imu.stream import ImuResiduals
 
 
@@ -93,9 +93,19 @@ def _intrinsics_words(imu: ImuSensor) -> Remark | None:
 
 
 def causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each IMU whose intrinsics are fixed at those of an ideal one, and are others."""
+    """A cause for each IMU whose accelerometer has axes at different places; else for each whose intrinsics are fixed
+    at those of an ideal one, and are others."""
+    places = {e.sensor: e for e in a.effects if e.spec is SIZE_EFFECT and e.differs}
+    for e in places.values():
+        # No second estimate with it: translations would refer to another point, the x axis, without being asked.
+        apart = 1e3 * float(np.linalg.norm(e.value.reshape(2, 3), axis=1).max())
+        sentence = (
+            f"the axes of the accelerometer of {e.sensor} are not at one place, but up to {apart:.2g} mm apart. Write "
+            "size_effect: free; translations then refer to its x axis."
+        )
+        yield Cause(Remark("imu_size_effect", sentence), e.gain)
     for e in a.effects:
-        if e.spec is INTRINSICS and e.differs:
+        if e.spec is INTRINSICS and e.differs and e.sensor not in places:
             k = int(np.argmax(np.abs(e.value / e.std)))
             sentence = (
                 f"the rig file calls {e.sensor} ideal (intrinsics: fixed), and it is not: {INTRINSICS_LABELS[k]} is "

@@ -77,7 +77,9 @@ INTRINSICS_LABELS = (
 )
 N_INTRINSICS = len(INTRINSICS_LABELS)
 INTRINSICS = ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1, is_effect=True)
-SIZE_EFFECT = ParameterSpec("size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3)
+SIZE_EFFECT = ParameterSpec(
+    "size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3, is_effect=True
+)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
 # consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.
