@@ -51,6 +51,9 @@ def by_yaml(text: str) -> Any:
     return found
 
 
+CAMERAS_ONLY = ("kalibr", "openvins", "vins-fusion", "orb-slam3", "camera-info", "colmap")
+
+
 def with_model(c: Calibration, name: str, model: str, distortion: list[float]) -> Calibration:
     sensors = {n: s | ({"model": model} if n == name else {}) for n, s in c.rig["sensors"].items()}
     groups = tuple(
@@ -395,6 +398,37 @@ def test_a_clock_that_restarts_has_no_offset_to_give(robot: Calibration, to: str
     else:
         sensor = "lidar0" if to == "lio-sam" else "cam0"
         assert f"the time offsets of {sensor} (one for each recording)" in texts
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_a_rolling_shutter_and_a_drifting_clock_are_said(robot: Calibration, to: str):
+    """cam0 reads its rows in 24 ms, and the clock of lidar0 is slow. No format but json has a field for a rate."""
+    cam0 = robot.rig["sensors"]["cam0"] | {"shutter": {"rolling": "rows", "readout": "free"}}
+    one, zero = np.ones(1), np.zeros(1)
+    values = {("cam0", "readout"): 0.024 * one, ("lidar0", "clock_rate"): 80.0 * one, ("cam1", "clock_rate"): zero}
+    more = [ParameterGroup(s, n, (n,), "", v, zero, zero, ("determined",), "free") for (s, n), v in values.items()]
+    groups, rig = (*robot.groups, *more), robot.rig | {"sensors": robot.rig["sensors"] | {"cam0": cam0}}
+    found = export(dataclasses.replace(robot, groups=groups, rig=rig), to)
+    texts = " ".join(found.files.values())
+    expected = {
+        "cam0": "cam0 has a rolling shutter, read out in 24.000 ms: its time offset is that of the middle row.",
+        "lidar0": "The clock of lidar0 has a rate of +80.0 ppm: its time offset is that of the middle of the "
+        "recording, and changes by +0.0800 ms each second.",
+    }
+    without = {name: f"no place for .*{name}" for name in expected if expected[name] not in found.sentences}
+    for sentence in found.sentences:
+        assert sentence in texts or to == "json"
+    for pattern in without.values():  # the whole sensor has no place in the format
+        assert re.search(pattern, " ".join(found.sentences))
+    assert set(without) == {"fast-lio": {"cam0"}, "lio-sam": {"cam0"}}.get(
+        to, {"lidar0"} if to in CAMERAS_ONLY else set()
+    )
+    assert "clock of cam1" not in texts
+    if to == "json":
+        data = json.loads(texts)
+        assert data["sensors"]["lidar0"]["parameters"]["clock_rate"] == 80.0
+        assert {"clock_rate", "readout"} <= data["conventions"].keys()
+        assert "clock_rate" not in export(robot, to).files["calibration.json"]
 
 
 def test_imu_intrinsics_that_have_no_place_are_said(robot: Calibration):

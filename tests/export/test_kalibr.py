@@ -200,9 +200,11 @@ def test_a_rolling_shutter_has_a_line_delay(calibration: Calibration, rolling: s
     text = camchain(rolled)
     assert yaml.safe_load(text)["cam1"]["line_delay"] == pytest.approx(0.024 / size)
     assert "line_delay" not in yaml.safe_load(text)["cam0"]
-    said = f"# cam1 has a rolling shutter: each {rolling[:-1]} is exposed line_delay [s] after the one before; "
-    assert said + f"timeshift_cam_imu is that of the middle {rolling[:-1]}." in text
+    said = (
+        f"# cam1: each {rolling[:-1]} is exposed line_delay [s] after the one before; timeshift_cam_imu is that of the "
+    )
+    assert said + f"middle {rolling[:-1]}." in text
     sentence = (
         f"cam1 has a rolling shutter, read out in 24.000 ms: its time offset is that of the middle {rolling[:-1]}."
     )
-    assert sentence in openvins(rolled).sentences
+    assert sentence in openvins(rolled).sentences and text.count(sentence) == 1

@@ -87,7 +87,7 @@ def rolling_shutter(c: Calibration, name: str) -> tuple[float, str, int] | None:
 
 
 def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
-    """A sentence for each of the sensors `names` that has unusable parameters, by verdict, or a rolling shutter."""
+    """A sentence for each of the sensors `names` that has unusable parameters, by verdict, and `moving_offsets`."""
     meanings: dict[Verdict, str] = {
         "unobservable": "unobservable, so the value depends on the initial guess",
         "too uncertain": f"too uncertain, with a standard deviation above {TOO_UNCERTAIN:g} tolerances",
@@ -103,13 +103,30 @@ def guesses(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
         ]
         if labels:
             sentences.append(f"{name}: {', '.join(labels)} is {meaning}.")
+    return (*sentences, *moving_offsets(c, names))
+
+
+def moving_offsets(c: Calibration, names: Sequence[str]) -> tuple[str, ...]:
+    """A sentence for each of the sensors `names` whose time offset differs from row to row, or changes with time."""
+    sentences = []
     for name in names:
         if (shutter := rolling_shutter(c, name)) is not None:
             sentences.append(
                 f"{name} has a rolling shutter, read out in {1e3 * shutter[0]:.3f} ms: its time offset is that of the "
                 f"middle {shutter[1]}."
             )
+        if rate := clock_rate(c, name):
+            sentences.append(
+                f"The clock of {name} has a rate of {rate:+.1f} ppm: its time offset is that of the middle of the "
+                f"recording, and changes by {1e-3 * rate:+.4f} ms each second."
+            )
     return tuple(sentences)
+
+
+def clock_rate(c: Calibration, name: str) -> float:
+    """Rate of the clock of sensor `name` [ppm]; 0 without one."""
+    group = c.group_or_none(name, "clock_rate")
+    return 0.0 if group is None else float(group.value[0])
 
 
 def guessed_poses(c: Calibration) -> tuple[str, ...]:

@@ -70,6 +70,11 @@ def plain_json(c: Calibration) -> Export:
             "relative": "T_a_b takes coordinates in the frame of b to that of a",
         }
     }
+    moving = {
+        "clock_rate": "change of time_offset with t_sensor, ppm; time_offset is that of the middle of the recording",
+        "readout": "from the first row to the one after the last, s; time_offset is that of the middle row",
+    }
+    data["conventions"] |= {name: moving[name] for name in moving if any(g.name == name for g in c.groups)}
     data |= yaml.safe_load(calibration_yaml(c))
     data |= {name: list(getattr(c, name)) for name in ("reasons", "unobservable", "warnings", "notes")}
     for sensor in data["sensors"].values():
@@ -122,8 +127,9 @@ def write_export(c: Calibration, to: str, folder: str | Path) -> tuple[str, ...]
 def kalibr(c: Calibration) -> Export:
     """Kalibr's camchain if there are cameras, and imu.yaml if there is an IMU."""
     sentences = no_place_for("Kalibr", others(c, *c.cameras, *imus(c)[1:])) + guesses(c, c.cameras)
-    comments = "".join(f"# {sentence}\n" for sentence in sentences)
-    files = {camchain_name(c): comments + camchain(c)} if c.cameras else {}
+    chain = camchain(c) if c.cameras else ""
+    comments = "".join(f"# {sentence}\n" for sentence in sentences if sentence not in chain)
+    files = {camchain_name(c): comments + chain} if c.cameras else {}
     if c.imu is not None:
         files["imu.yaml"] = imu_yaml(c)
     return Export(files, sentences)

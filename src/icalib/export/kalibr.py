@@ -18,6 +18,7 @@ from icalib.export.common import (
     imus,
     inverse,
     lens_of,
+    moving_offsets,
     restarts,
     rolling_shutter,
     time_offset,
@@ -79,12 +80,13 @@ def camchain(calibration: Calibration) -> str:
         if restarts(c, name)
     ]
     rolling = [
-        f"# cam{i} has a rolling shutter: each {shutter[1]} is exposed line_delay [s] after the one before; "
-        f"timeshift_cam_imu is that of the middle {shutter[1]}."
+        f"# cam{i}: each {shutter[1]} is exposed line_delay [s] after the one before; timeshift_cam_imu is that of the "
+        f"middle {shutter[1]}."
         for i, name in enumerate(c.cameras)
         if (shutter := rolling_shutter(c, name)) is not None
     ]
-    return _text([comment, *_renamed("cam", c.cameras), *restarting, *rolling, *fits], data)
+    moving = [f"# {sentence}" for sentence in moving_offsets(c, c.cameras)]
+    return _text([comment, *_renamed("cam", c.cameras), *restarting, *moving, *rolling, *fits], data)
 
 
 def imu_yaml(calibration: Calibration) -> str:

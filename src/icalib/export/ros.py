@@ -22,6 +22,7 @@ from icalib.export.common import (
     imu_intrinsics,
     inverse,
     lens_of,
+    moving_offsets,
     need,
     no_place_for,
     others,
@@ -100,7 +101,7 @@ def camera_info(c: Calibration) -> Export:
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
     omissions = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_intrinsics(c)]
-    sentences += no_place_for("CameraInfo", omissions)
+    sentences += no_place_for("CameraInfo", omissions) + moving_offsets(c, c.cameras)
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 
 

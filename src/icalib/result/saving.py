@@ -279,7 +279,8 @@ HEADER = """\
 # Calibration by icalib {version}. Lengths in m, times in s, angles in rad, image quantities in px.
 # {key} takes coordinates in the sensor's frame to the {body} frame: p_{body} = {key} p_sensor.
 {frames}# time_offset: t_{reference} = t_sensor + time_offset; a list, one for each recording, where a clock restarts.
-#   That is in the middle of the recording. clock_rate, ppm, is the change of time_offset with t_sensor.
+#   That is in the middle of the recording, and of the middle row of a rolling shutter. clock_rate, ppm, is its change
+#   with t_sensor; readout is the time from the first row to the one after the last.
 # std: standard deviations, of rotation about the sensor's axes, of translation along the {body} axes. They include
 #   empirical_factor: the scatter of segments over the predicted one; formal = std / factor. Those of roll_pitch_yaw,
 #   R = Rz(yaw) Ry(pitch) Rx(roll), are null within 5 std of gimbal lock (pitch 90 deg). What is fixed has none.
