@@ -197,7 +197,7 @@ def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
     if chromium is None:
         pytest.skip("no chromium is installed; install one to have the report drawn")
     file = tmp_path / "page.html"
-    printing = "<script>dispatchEvent(new Event('beforeprint'))</script></body>"
+    printing = "<script>setTimeout(() => dispatchEvent(new Event('beforeprint')), 4000)</script></body>"
     flags = (
         "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
         "--disable-component-update --disable-sync --use-angle=swiftshader --enable-unsafe-swiftshader "

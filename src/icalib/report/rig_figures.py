@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,18 +35,13 @@ def rig_picture(c: Calibration) -> Figure:
     """Axes and shapes of all sensors in the imu frame [m], with magnified ellipsoids of their position uncertainty."""
     frames, spread = frames_of(c), spread_of(c)
     origins = np.array([T[:3, 3] for T in frames.values()])
-    traces = [
-        path_3d(
-            _axis_line(frames, i, 0.25 * spread), "xyz"[i], AXIS_COLORS[i], line={"color": AXIS_COLORS[i], "width": 6}
-        )
-        for i in range(3)
-    ]
+    traces = _axes(list(frames.values()), 0.25 * spread)
     shapes = [(name, pen) for name in c.mounted if (pen := shape_of(c, name)) is not None]
     for i, (name, pen) in enumerate(shapes):
         color, T = COLORS[i % len(COLORS)], frames[name]
         traces.append(path_3d(pen @ T[:3, :3].T + T[:3, 3], name, color, line={"color": color, "width": 2}))
     factor = magnification(c)
-    traces += [_uncertainty(e, frames[e.sensor][:3, 3], factor) for e in ellipsoids(c)]
+    traces += [_uncertainty(e, frames[e.sensor][:3, 3], factor, spread) for e in ellipsoids(c)]
     traces.append(
         path_3d(
             origins, "sensors", "#111827", mode="markers+text", text=list(frames), marker={"size": 4}, showlegend=False
@@ -58,15 +54,21 @@ def rig_picture(c: Calibration) -> Figure:
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 
 
-def _axis_line(frames: dict[str, np.ndarray], i: int, length: float) -> np.ndarray:
-    """(n, 3) line of this length [m] along axis i of each frame."""
-    pieces = [np.stack([T[:3, 3], T[:3, 3] + length * T[:3, i]]) for T in frames.values()]
-    return np.concatenate([np.vstack([p, PEN_UP]) for p in pieces])
+def _axes(frames: Sequence[np.ndarray], length: float) -> list[dict[str, Any]]:
+    """Traces of the axes of frames T (4, 4), lines of this length [m]."""
+    lines = [
+        np.concatenate([np.vstack([T[:3, 3], T[:3, 3] + length * T[:3, i], PEN_UP]) for T in frames]) for i in range(3)
+    ]
+    styles = [{"color": color, "width": 6} for color in AXIS_COLORS]
+    return [path_3d(lines[i], "xyz"[i], AXIS_COLORS[i], line=styles[i]) for i in range(3)]
 
 
-def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float) -> dict[str, Any]:
-    color = VERDICT_COLORS[e.verdict]
-    return path_3d(outline(e, factor) + origin, f"{e.sensor}: {e.verdict}", color, line={"color": color, "width": 3})
+def _uncertainty(e: Ellipsoid, origin: np.ndarray, factor: float, longest: float) -> dict[str, Any]:
+    """Trace of an ellipsoid, whose axes are cut at a half length of `longest` [m]."""
+    color, short = VERDICT_COLORS[e.verdict], np.minimum(factor * e.half_sizes, longest)
+    name = f"{e.sensor}: {e.verdict}{', cut' if (factor * e.half_sizes > longest).any() else ''}"
+    style = {"color": color, "width": 3}
+    return path_3d(outline(replace(e, half_sizes=short), 1.0) + origin, name, color, line=style)
 
 
 def correlation(c: Calibration) -> Figure:
@@ -209,19 +211,19 @@ def motion(c: Calibration) -> Figure:
 
 
 def trajectory(c: Calibration) -> Figure:
-    """Trajectory of the reference frame in the world frame, coloured by time, with the outlines of the target."""
+    """Trajectory of the reference frame in the world frame, coloured by time, or its axes at each stop, with the
+    outlines of the target."""
     path = c.trajectory
     keep = thin(len(path.seconds), MAX_PLOTTED_KEYFRAMES)
     color = {"color": numbers(path.seconds[keep]), "colorscale": "Viridis", "width": 4}
     color |= {"showscale": True, "colorbar": {"title": {"text": "time [s]"}, "thickness": 10}}
-    ends = path.position[[0, -1]]
-    traces = [
-        path_3d(_lifted(c, path.position)[keep], c.reference, "", line=color, showlegend=False),
-        path_3d(
-            ends, "ends", "#111827", mode="markers+text", text=["start", "end"], marker={"size": 3}, showlegend=False
-        ),
-        *_board(c),
-    ]
+    ends, words = path.position[[0, -1]], {"mode": "markers+text", "text": ["start", "end"], "showlegend": False}
+    traces = [path_3d(_lifted(c, path.position)[keep], c.reference, "", line=color, showlegend=False)]
+    if not c.rates:  # of stops, which no motion connects
+        stops = np.tile(np.eye(4), (len(keep), 1, 1))
+        stops[:, :3, :3], stops[:, :3, 3] = path.rotation[keep], path.position[keep]
+        traces = _axes(list(stops), 0.1 * float(np.ptp(path.position, axis=0).max()))
+    traces += [path_3d(ends, "ends", "#111827", marker={"size": 3}, **words), *_board(c)]
     scene = {name: {"title": {"text": f"world {name[0]} [m]"}, "nticks": 6} for name in ("xaxis", "yaxis", "zaxis")}
     return figure(traces, 520, scene=scene | VIEW, margin={"l": 0, "r": 0, "t": 30, "b": 0})
 

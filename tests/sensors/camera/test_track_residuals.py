@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.pages import figures_of
 
 from icalib.data.measurements import Measurements, TrackStream
 from icalib.pipeline import calibrate_measurements
@@ -134,5 +135,6 @@ def test_the_report_shows_them(found: Calibration, tmp_path: Path, assert_drawn:
     assert words + (f", {left_out} left out with their tracks" if left_out else "") in text
     total = sum(len(x.uv) for x in found.track_residuals)
     assert f"with {total} observations of points that were followed" in text and "0 corners" not in text
-    assert '"cam0 observations (u and v)"' in text and "like those it saw" in text
+    assert "cam0 observations (u and v)" in {t["name"] for t in figures_of(text)["histogram"]["data"]}
+    assert "like those it saw" in text
     assert_drawn(text, {f"{kind}-{i}" for kind in ("plane", "image", "time") for i in range(3)})

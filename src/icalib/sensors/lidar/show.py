@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import cycle
 from typing import Any
 
 import numpy as np
 
 from icalib.report.figures import (
+    COLORS,
     VIEW,
     Figure,
     ResidualCloud,
@@ -18,6 +20,7 @@ from icalib.report.figures import (
     line,
     numbers,
     path_3d,
+    shown_range,
     thin,
 )
 from icalib.report.page import Group, Plot, Presenter, Section
@@ -32,6 +35,8 @@ MIN_BIN_POINTS = 20  # of a figure bin; their RMS has a standard deviation of 16
 CURVE_BIN_S = 0.1  # duration of a bin of the curves in the 3D view: some thousand points of a usual LiDAR
 MAX_COLOR_RMS = 4.0  # end of the colour scale, in RMS of the result
 MAX_RESIDUAL_RMS = 5.0  # end of the residual axis, in RMS of the residuals
+MAX_WALL_SLOPE = 0.5  # sine of the inclination of a wall
+MAX_WALL_POINTS = 4000  # of a LiDAR from above
 MIN_SLOPE = 0.1  # sine; the outline of a flatter plane is aligned with the axes of the world
 _WALL = "#64748b"
 _MAPS = (("Points as the first guess had them", "map-before"), ("Points as calibrated", "map-after"))
@@ -40,6 +45,11 @@ _SECTION_WORDS = (
     "a mean without a pattern in time and distance. The planes of the first guess are those that fit its points "
     "best. Each recording has a world of its own; the menu above each map chooses among several. At most "
     f"{MAX_MAP_POINTS} points are drawn in space, {MAX_DOTS} of a kind below, evenly picked."
+)
+_WHEN = ("before", "after")
+_WALL_WORDS = (
+    "Points on walls in the first recording, a colour for each LiDAR, by the first guess and by the result. Lines of "
+    "two LiDARs lie on one another if they are calibrated."
 )
 LEGEND = "rings are LiDARs"
 
@@ -50,6 +60,9 @@ def sections(c: Calibration) -> Iterator[Section]:
         return
     maps = plane_maps(c)
     groups = [Group(plots=[Plot(name, maps[name], title) for title, name in _MAPS])]
+    if len(c.lidar_residuals) > 1:
+        plots = [Plot(f"walls-{when}", walls(c, when == "before"), f"Walls from above, {when}") for when in _WHEN]
+        groups.append(Group("All LiDARs", plots, words=_WALL_WORDS))
     for i, r in enumerate(c.lidar_residuals):
         first, now = (1e3 * float(np.sqrt(np.mean(x.astype(np.float64) ** 2))) for x in (r.first_residual, r.residual))
         counts = (
@@ -153,6 +166,21 @@ def plane_maps(c: Calibration) -> dict[str, Figure]:
         traces.append(([_cloud(before, in_recording, top)], [_cloud(after, in_recording, top), walls]))
     first, now = zip(*traces, strict=True)
     return {"map-before": _map(list(first), names), "map-after": _map(list(now), names)}
+
+
+def walls(c: Calibration, before: bool) -> Figure:
+    """Points of each LiDAR on planes along z of the world, from above, by the first guess or by the result."""
+    upright = np.array([abs(plane.normal[2]) < MAX_WALL_SLOPE for plane in c.planes])
+    traces, ends = [], []
+    for r, color in zip(c.lidar_residuals, cycle(COLORS)):
+        on_wall = np.flatnonzero(upright[r.plane] & (c.recording_of(r.seconds) == 0))
+        some = on_wall[thin(len(on_wall), MAX_WALL_POINTS)]
+        x, y = (r.first_world if before else r.world)[some, :2].astype(np.float64).T
+        traces.append(dots(x, y, r.sensor, color, 2.5))
+        ends.append(r.world[some, :2])
+    (x0, x1), (y0, y1) = (shown_range(np.concatenate(ends)[:, k]) for k in range(2))
+    across = {"scaleanchor": "x", "range": [y0, y1]}
+    return figure(traces, 460, xaxis=axis("world x [m]", range=[x0, x1]), yaxis=axis("world y [m]", **across))
 
 
 def _cloud(cloud: tuple[np.ndarray, np.ndarray], chosen: np.ndarray, top: float) -> dict[str, Any]:
