@@ -41,6 +41,7 @@ from icalib.optim.state import FURTHER_IMU_DIM, Block, Key, Layout, State
 from icalib.rig import Parameter, Rig
 from icalib.rig.scene import FRAME as SENSOR_FRAME
 from icalib.rig.scene import FRAME_OFFSET, GRAVITY, LEVEL_FRAME, PLANE, SHAPE_LABELS, SHEET_MIDDLE, WORLD
+from icalib.rig.scene import SIZE as SIZE_SPEC
 from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET, TRANSLATION
 
 # The least-squares problem of one pass: sums of all factors and priors over the pieces of the chain (iCalib paper
@@ -257,11 +258,9 @@ def _nuisance_priors(inputs: Inputs) -> tuple[Prior, ...]:
     here."""
     rig, one, priors = inputs.rig, np.ones(1), []
     of_scene = {
-        SIZE: (one, rig.target.size_sigma * one),
+        SIZE: (one, (rig.target.size_sigma or SIZE_SPEC.prior_sigma) * one),  # score tests free an exact one
         (WORLD, GRAVITY.name): (rig.gravity * one, rig.gravity_sigma * one),
     }
-    if not rig.target.size_sigma:  # exact in the estimate; a score test frees it
-        del of_scene[SIZE]
     for block in inputs.layout.free:
         stated = inputs.stated(block)
         if block.key in of_scene:

@@ -315,15 +315,19 @@ def relaxed(inputs: Inputs, estimate: Estimate) -> Relaxed | None:
     The state does not move, and priors still act: `Relaxed.step` frees chosen groups and drops their priors. None if
     the rig file states none of these, if the solver did not converge, or if the equations are singular.
     """
-    is_sized = bool(inputs.bodies.used)
-    is_stated = is_sized or any(_is_stated(p) for _, _, p in groups_of(inputs.rig))
+    is_stated = bool(inputs.bodies.used) or any(_is_stated(p) for _, _, p in groups_of(inputs.rig))
     if not estimate.outcome.converged or not is_stated:
         return None
-    freed = freed_inputs(replace(inputs, bodies=replace(inputs.bodies, sized=is_sized)))
+    freed = freed_inputs(_sized(inputs))
     if (linearised := _linearised(freed, estimate)) is None:
         return None
     problem, state, solution, residuals = linearised
     return Relaxed(freed, problem, state, solution, residuals, inputs.layout, tuple(stated_keys(inputs, freed.layout)))
+
+
+def _sized(inputs: Inputs) -> Inputs:
+    """The inputs with the size of the target as a parameter."""
+    return replace(inputs, bodies=replace(inputs.bodies, sized=bool(inputs.bodies.used)))
 
 
 def _linearised(
@@ -494,7 +498,7 @@ def _with_effects(inputs: Inputs, effects: Collection[Key]) -> Inputs:
             return p
         return Parameter("prior", p.value, np.full(p.size, sensor.spec(name).prior_sigma))
 
-    return _of_rig(inputs, with_groups(rig, estimated, rig.sensors.values()))
+    return _of_rig(_sized(inputs), with_groups(rig, estimated, rig.sensors.values()))
 
 
 @dataclass(frozen=True)
