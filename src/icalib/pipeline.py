@@ -25,8 +25,8 @@ from icalib.initialize.rig_guess import Attempt, attempt, solved
 from icalib.kinds import readers
 from icalib.optim.memory import set_mmap_threshold, trim_heap
 from icalib.result import Calibration, Visited
-from icalib.result.calibration import provenance
 from icalib.result.pictures import pictures
+from icalib.result.saving import provenance
 from icalib.rig import Rig
 from icalib.rig.file import check_complete, load_rig
 from icalib.validation import assess, stated_words, visited

@@ -13,7 +13,7 @@ from tests.cases import each
 
 from icalib.base.files import HashedFile, hash_of, load_arrays
 from icalib.data.recordings import open_recording
-from icalib.result.calibration import provenance
+from icalib.result.saving import provenance
 from icalib.tools.simulation import handheld, simulate, write_sensors
 
 CONTENT = np.random.default_rng(0).bytes(10_000)

@@ -67,6 +67,22 @@ def test_notebooks_show_the_same_as_html(robot: Calibration):
     assert " ".join(" ".join(t.split()) for t in found.texts[1 + len(sharp.reasons) :] if t) == words
 
 
+def test_figures_for_notebooks(robot: Calibration):
+    """They are those of the report, as objects of plotly."""
+    assert {t.name for t in robot.plot_rig().data} >= {"sensors", "cam0", "lidar0"}
+    assert {t.name for t in robot.plot_trajectory().data} >= {"imu0", "ends", "board0"}
+    for sensor in ("imu0", "cam0", "lidar0", "wheel0"):
+        figure = robot.plot_residuals(sensor)
+        assert figure.layout.xaxis.title.text == "time [s]" and len(figure.data[0].x) > 50
+    (count,) = robot.plot_coverage("cam0").data
+    used = next(r for r in robot.corner_residuals if r.sensor == "cam0").used
+    assert np.nansum(np.array(count.z, float)) == used.sum()
+    with pytest.raises(KeyError, match="no residuals of lidar9; there are .*corners of cam0"):
+        robot.plot_residuals("lidar9")
+    with pytest.raises(KeyError, match="no images of lidar0; there are cam0, cam1"):
+        robot.plot_coverage("lidar0")
+
+
 def test_values_and_standard_deviations(robot: Calibration):
     assert robot.value("wheel0", "radii").tolist() == [0.1, 0.102]
     np.testing.assert_array_equal(robot.std("cam0", "rotation"), robot.group("cam0", "rotation").std)

@@ -154,6 +154,20 @@ def cut_marks(x: np.ndarray, y: np.ndarray, low: float, high: float, **more: Any
     return dots(x[keep], np.clip(y[keep], low, high), "beyond the frame", "", marker=marker, **named, **more)
 
 
+# Coverage of an image.
+
+CELL_PX = 40
+
+
+def coverage(count: np.ndarray, size: tuple[int, int]) -> Figure:
+    """Number of points in each cell, count (rows, columns), of an image of this size (width, height) [px]."""
+    v, u = ((np.arange(n) + 0.5) * side / n - 0.5 for n, side in zip(count.shape, reversed(size), strict=True))
+    heat = {"type": "heatmap", "x": numbers(u), "y": numbers(v), "z": numbers(np.where(count > 0, count, np.nan))}
+    heat |= {"colorscale": "YlGnBu", "reversescale": True, "colorbar": {"title": {"text": "points"}, "thickness": 10}}
+    down = axis("v [px]", range=[size[1] - 0.5, -0.5], scaleanchor="x", constrain="domain")
+    return figure([heat], 330, xaxis=axis("u [px]", range=[-0.5, size[0] - 0.5], constrain="domain"), yaxis=down)
+
+
 # Histogram of the normalised residuals of all sensors.
 
 REACH = 6.0  # range of the histogram on either side of zero, in standard deviations

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, TypeVar, cast
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -21,10 +21,12 @@ from icalib.detection.images import MOST_PICTURES
 from icalib.kinds import presenters
 from icalib.report import pictures, rig_figures
 from icalib.report.figures import (
+    CELL_PX,
     Figure,
     ResidualCloud,
     ResidualCurve,
     axis,
+    coverage,
     dots,
     figure,
     line,
@@ -300,6 +302,37 @@ def row_sections(c: Calibration, kind: str, name: str, title: str, words: str) -
     if residuals:
         plots = [Plot(f"{name}-{i}", panels(r), f"{r.sensor}: residuals over time") for i, r in enumerate(residuals)]
         yield Section(name, title, f"Predicted - measured. {words}".strip(), [Group(plots=plots)])
+
+
+# Figures for notebooks.
+
+
+def residuals_over_time(c: Calibration, sensor: str, kind: str = "") -> Figure:
+    """Figure of one residual record. Raises KeyError, which lists the records."""
+    for r in c.residuals.values():
+        if r.sensor == sensor and kind in ("", r.kind):
+            of_kind = presenters()[c.rig["sensors"][sensor]["type"]].over_time
+            return of_kind(r) if of_kind else panels(cast(RowResiduals, r))
+    there = ", ".join(f"{r.kind} of {r.sensor}" for r in c.residuals.values())
+    raise KeyError(f"no {kind or 'residuals'} of {sensor}; there are {there}")
+
+
+def image_coverage(c: Calibration, camera: str) -> Figure:
+    """Number of measured points in use in each cell of the image. Raises KeyError, which lists the cameras."""
+    points = {r.sensor: r.uv[r.used] for r in c.image_residuals}
+    if camera not in points:
+        raise KeyError(f"no images of {camera}; there are {', '.join(points)}")
+    width, height = c.rig["sensors"][camera]["resolution"]
+    grid, (u, v) = (max(1, height // CELL_PX), max(1, width // CELL_PX)), points[camera].T
+    count, _, _ = np.histogram2d(v, u, grid, ((-0.5, height - 0.5), (-0.5, width - 0.5)))
+    return coverage(count, (width, height))
+
+
+def plotly_figure(drawn: Figure) -> Any:
+    """A figure of the page as `plotly.graph_objects.Figure`."""
+    from plotly.graph_objects import Figure as PlotlyFigure  # takes a second
+
+    return PlotlyFigure(drawn)
 
 
 # Extrinsics on the first screen.
@@ -583,12 +616,14 @@ R = TypeVar("R", bound=Residuals)
 class Presenter(Generic[R]):
     """What report, console and 3D view show of one kind of sensor.
 
-    sections: of the report. curves: of one residual record over time; None: one for each column. clouds: points and the
-    size of their residuals. amounts: numbers of measurements, as text. shape: (n, 3) polylines in the sensor frame [m],
+    sections: of the report. over_time: figure of one residual record; None: `panels`. curves: of one residual record
+    over time; None: one for each column. clouds: points and the size of their residuals. amounts: numbers of
+    measurements, as text. shape: (n, 3) polylines in the sensor frame [m],
     for a rig of the given size [m]. legend: explains the shape.
     """
 
     sections: Callable[[Calibration], Iterable[Section]]
+    over_time: Callable[[R], Figure] | None = None
     curves: Callable[[R], Iterable[ResidualCurve]] | None = None
     clouds: Callable[[Calibration], Iterable[ResidualCloud]] = lambda _: ()
     amounts: Callable[[Calibration], Iterable[str]] = lambda _: ()

@@ -188,7 +188,7 @@ def outline(e: Ellipsoid, factor: float) -> np.ndarray:
 
 # Figures of the trajectory, its derivatives, and the convergence of the solver.
 
-MAX_PLOTTED_KEYFRAMES = 2000
+MAX_PLOTTED_KEYFRAMES = 1500
 
 
 def motion(c: Calibration) -> Figure:

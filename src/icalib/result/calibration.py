@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from icalib.base.extras import load_pandas
-from icalib.base.files import hash_of
 from icalib.base.remark import Remark
 from icalib.data.measurements import Part
 from icalib.motion.factor import ResidualRows
@@ -422,6 +419,32 @@ class Calibration:
 
         write_sealed(Path(path), printable(report_html(self)))
 
+    def plot_rig(self) -> Any:
+        """The sensors in the frame of `reference` as a plotly figure in 3D, with their uncertainty."""
+        from icalib.report.page import plotly_figure, rig_figures
+
+        return plotly_figure(rig_figures.rig_picture(self))
+
+    def plot_trajectory(self) -> Any:
+        """The trajectory in the world and the target as a plotly figure in 3D."""
+        from icalib.report.page import plotly_figure, rig_figures
+
+        return plotly_figure(rig_figures.trajectory(self))
+
+    def plot_residuals(self, sensor: str, kind: str = "") -> Any:
+        """Residuals of `sensor` over time as a plotly figure; kind: of several, by default the first. Raises KeyError,
+        which lists sensors and kinds."""
+        from icalib.report.page import plotly_figure, residuals_over_time
+
+        return plotly_figure(residuals_over_time(self, sensor, kind))
+
+    def plot_coverage(self, camera: str) -> Any:
+        """Number of corners or tracked points in use over the image of `camera` as a plotly figure. Raises KeyError,
+        which lists the cameras with residuals."""
+        from icalib.report.page import image_coverage, plotly_figure
+
+        return plotly_figure(image_coverage(self, camera))
+
     def __repr__(self) -> str:
         from icalib.result.quantities import one_line
 
@@ -570,23 +593,6 @@ def _check(part: Any, what: str, shapes: Shapes) -> None:
 def _check_kind(what: str, array: np.ndarray, kinds: str) -> None:
     if array.dtype.kind not in kinds:
         raise ValueError(f"{what} holds {array.dtype}, not {_WORDS[kinds]} values")
-
-
-# Provenance of a result: hashes of its input files, and versions of the software.
-
-_LIBRARIES = ("numpy", "numba")
-
-
-def provenance(files: list[Path]) -> dict[str, str]:
-    """SHA-256 of the content of each file, in hexadecimal, by path."""
-    return {str(f): hash_of(f).hexdigest() for f in files}
-
-
-def versions() -> dict[str, str]:
-    """Versions of icalib, Python and the libraries that the numbers depend on."""
-    from icalib import __version__
-
-    return {"icalib": __version__, "python": platform.python_version()} | {n: version(n) for n in _LIBRARIES}
 
 
 # The clock of a result: recordings follow one another with a pause of `PAUSE_S` between them.

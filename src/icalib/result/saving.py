@@ -6,8 +6,10 @@ import dataclasses
 import hashlib
 import io
 import json
+import platform
 from collections import Counter
 from collections.abc import Callable, Iterable
+from importlib.metadata import version
 from math import isnan
 from pathlib import Path
 from typing import Any, Literal
@@ -15,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
-from icalib.base.files import NAME, load_arrays, printable, read_file, sealed
+from icalib.base.files import NAME, hash_of, load_arrays, printable, read_file, sealed
 from icalib.base.remark import Remark
 from icalib.base.yaml_nodes import LARGEST
 from icalib.errors import CalibrationError, RigError
@@ -500,3 +502,20 @@ def _treated(g: ParameterGroup, old: Parameter, treatment: Treatment) -> tuple[P
     if not (np.isfinite(g.std) & (g.std > 0.0)).all():
         return Parameter("free", g.value), f"{g.sensor}: {g.name} has no finite standard deviation, so it is a guess."
     return Parameter("prior", g.value, g.std), ""
+
+
+# Provenance of a result: hashes of its input files, and versions of the software.
+
+_LIBRARIES = ("numpy", "numba")
+
+
+def provenance(files: list[Path]) -> dict[str, str]:
+    """SHA-256 of the content of each file, in hexadecimal, by path."""
+    return {str(f): hash_of(f).hexdigest() for f in files}
+
+
+def versions() -> dict[str, str]:
+    """Versions of icalib, Python and the libraries that the numbers depend on."""
+    from icalib import __version__
+
+    return {"icalib": __version__, "python": platform.python_version()} | {n: version(n) for n in _LIBRARIES}

@@ -47,7 +47,8 @@ from icalib.result import (
     Visited,
     by_key,
 )
-from icalib.result.calibration import Timeline, row_record, versions
+from icalib.result.calibration import Timeline, row_record
+from icalib.result.saving import versions
 from icalib.result.verdict import AUXILIARY, failure_words, named_few
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from icalib.report.figures import REJECTED, Figure, ResidualCurve, axis, dots, figure, line, numbers, thin
+from icalib.report.figures import CELL_PX, REJECTED, Figure, ResidualCurve, axis, dots, figure, line, numbers, thin
 from icalib.report.page import Group, Plot, Presenter, Section
 from icalib.report.rig_figures import PEN_UP
 from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
@@ -18,7 +18,6 @@ from icalib.sensors.camera.stream import ImageResiduals, image_of
 
 MOST_DOTS = 2500  # dots of each kind in one figure; more are thinned out
 BINS = 60
-CELL_PX = 40
 FEWEST_IN_CELL = 5
 
 
@@ -308,6 +307,7 @@ def map_words(m: ProjectionMap) -> str:
 
 PRESENTER = Presenter(
     sections=sections,
+    over_time=residuals_over_time,
     curves=curves,
     amounts=amounts,
     shape=shape,

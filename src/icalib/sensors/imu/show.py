@@ -23,11 +23,11 @@ def sections(c: Calibration) -> Iterator[Section]:
     for k, residuals in enumerate(c.imu_residuals):
         title = f"Residuals of {residuals.sensor}" if len(c.imu_residuals) > 1 else "IMU residuals"
         place = f"imu-residuals-{k}" if k else "imu-residuals"
-        plot = Plot(place, _residual_figure(residuals), f"{residuals.sensor}: residuals over time")
+        plot = Plot(place, residuals_over_time(residuals), f"{residuals.sensor}: residuals over time")
         yield Section(f"inertial-{k}" if k else "inertial", title, _WORDS, [Group(plots=[plot])])
 
 
-def _residual_figure(r: ImuResiduals) -> Figure:
+def residuals_over_time(r: ImuResiduals) -> Figure:
     """Whitened residuals over time: standard normal, or smaller where the trajectory absorbs noise."""
     keep = thin(len(r.seconds), MAX_PLOTTED_KEYFRAMES)
     panels = [(r.seconds[keep], r.whitened[keep, 3 * b : 3 * b + 3]) for b in range(len(BLOCKS))]
@@ -42,6 +42,7 @@ def curves(r: ImuResiduals) -> Iterator[ResidualCurve]:
 
 PRESENTER = Presenter(
     sections=sections,
+    over_time=residuals_over_time,
     curves=curves,
     legend=LEGEND,
 )

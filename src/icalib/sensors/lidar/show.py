@@ -29,7 +29,7 @@ from icalib.result import Calibration, Plane
 from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_DOTS = 2500  # points in a figure of residuals: more hide one another
-MAX_MAP_POINTS = 20_000  # points in a 3D map of the planes: keeps the page small
+MAX_MAP_POINTS = 10_000  # points in a 3D map of the planes: keeps the page small
 N_FIGURE_BINS = 60  # along the x axis of RMS and mean
 MIN_BIN_POINTS = 20  # of a figure bin; their RMS has a standard deviation of 16 %
 CURVE_BIN_S = 0.1  # duration of a bin of the curves in the 3D view: some thousand points of a usual LiDAR
@@ -236,6 +236,7 @@ def _level_axes(normal: np.ndarray) -> np.ndarray:
 
 PRESENTER = Presenter(
     sections=sections,
+    over_time=residuals_over_time,
     curves=curves,
     clouds=clouds,
     amounts=amounts,

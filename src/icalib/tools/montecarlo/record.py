@@ -16,7 +16,7 @@ from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration, Visited
-from icalib.result.calibration import versions
+from icalib.result.saving import versions
 from icalib.sensors.stream import Successive
 from icalib.tools.batch import check_worker, plain_record, program, record_json, sentence_on, write_atomically
 from icalib.tools.simulation import Scenario, Truth, rig_for, simulate, with_drawn_guess

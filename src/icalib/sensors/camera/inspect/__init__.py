@@ -14,7 +14,7 @@ from rich.text import Text
 from icalib.data.recordings import BagRecording, Recording, TopicInfo
 from icalib.detection.images import spread_images
 from icalib.errors import RecordingError
-from icalib.report.figures import Figure, axis, figure, numbers
+from icalib.report.figures import coverage
 from icalib.report.page import Plot
 from icalib.report.pictures import Drawing, squares
 from icalib.sensors.camera.inspect.facts import (
@@ -332,7 +332,8 @@ class CameraInspector(KindInspector):
             size = resolution_of(inspection, name, camera_sources(inspection)[name])
             if size is None or view.cells is None:
                 continue
-            plots.append(Plot(f"coverage-{name}", _coverage(view.cells, size), f"{name}: corners over the image"))
+            drawn = coverage(np.array(view.cells), size)
+            plots.append(Plot(f"coverage-{name}", drawn, f"{name}: corners over the image"))
             for k, (jpeg, uv) in enumerate(view.images_seen):
                 words, image = f"{name}: {len(uv)} corners of the target", b64encode(jpeg).decode()
                 drawings.append(Drawing(size, words, [squares(uv, size[0])], [], f"seen-{name}-{k}", image))
@@ -444,15 +445,6 @@ def coverage_maps(inspection: Inspection) -> Iterator[Text]:
         if view.cells:
             yield Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):")
             yield Text(coverage_map(view.cells))
-
-
-def _coverage(cells: tuple[tuple[int, ...], ...], size: tuple[int, int]) -> Figure:
-    """Number of corners in each cell of an image of this size (width, height) [px]."""
-    u, v = ((np.arange(n) + 0.5) * side / n for n, side in zip((len(cells[0]), len(cells)), size, strict=True))
-    heat = {"type": "heatmap", "x": numbers(u), "y": numbers(v), "z": [[n or None for n in row] for row in cells]}
-    heat |= {"colorscale": "YlGnBu", "reversescale": True, "colorbar": {"title": {"text": "corners"}, "thickness": 10}}
-    down = axis("v [px]", range=[size[1], 0], scaleanchor="x", constrain="domain")
-    return figure([heat], 330, xaxis=axis("u [px]", range=[0, size[0]], constrain="domain"), yaxis=down)
 
 
 def coverage_map(cells: tuple[tuple[int, ...], ...]) -> str:
