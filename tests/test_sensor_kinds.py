@@ -35,8 +35,7 @@ NAMING = {
     "tools/simulation/filming.py",
     "tools/simulation/rigs.py",
     "tools/simulation/scenario.py",
-    "tools/simulation/rooms.py",  # several LiDARs at rest
-    "tools/simulation/stops.py",  # a camera and a LiDAR at rest
+    "tools/simulation/stops.py",  # cameras and LiDARs at rest
     "tools/simulation/writing.py",
     "tools/view.py",  # shows what cameras, IMUs and LiDARs recorded
     "tools/simulation/corners.py",

@@ -23,8 +23,17 @@ from icalib.sensors.lidar.initialize.boards import at_places, sees_the_same
 from icalib.sensors.lidar.initialize.surroundings import at_stops
 from icalib.tools.inspection import GivenTarget, draft_rig, inspect_recording
 from icalib.tools.simulation.output import BagWriter
-from icalib.tools.simulation.rooms import CORRIDOR, STREET, Surroundings, simulate_surroundings
-from icalib.tools.simulation.stops import ONCE, Pauses, Stops, load_stops, simulate_stops
+from icalib.tools.simulation.stops import (
+    CORRIDOR,
+    ONCE,
+    STREET,
+    Pauses,
+    Stops,
+    Surroundings,
+    load_stops,
+    simulate_stops,
+    simulate_surroundings,
+)
 
 CARRIED = Path(__file__).parents[3] / "examples" / "stops" / "carried-board.yaml"
 BOARD = Stops(6, azimuth_steps=900, pauses=Pauses(sway_m=0.002))

@@ -21,7 +21,7 @@ from icalib.rig.file import rig_from_dict
 from icalib.sensors.lidar.initialize.registration import Surfels, register
 from icalib.sensors.lidar.patch_factor import PatchPoints, PatchRows
 from icalib.tools.inspection import draft_rig, inspect_recording
-from icalib.tools.simulation.rooms import CORRIDOR, STREET, Surroundings, pose, simulate_surroundings
+from icalib.tools.simulation.stops import CORRIDOR, STREET, Surroundings, pose, simulate_surroundings
 
 pytestmark = pytest.mark.slow
 
