@@ -16,7 +16,7 @@ import pytest
 from tests.cases import each
 from tests.typed import instance
 
-from icalib.data.bags import bag_files
+from icalib.data.bag_recording import bag_files
 from icalib.data.measurements import ImuStream
 from icalib.data.recordings import BagRecording, Recording, decode, open_recording, read_measurements
 from icalib.errors import RecordingError

@@ -11,8 +11,7 @@ from math import inf
 from pathlib import Path
 
 from icalib.base.files import HEAD_BYTES, is_video, not_data
-from icalib.data.bag_recording import BagRecording
-from icalib.data.bags import bag_files
+from icalib.data.bag_recording import BagRecording, bag_files
 from icalib.data.folder import FolderRecording, PictureFolder, has_pictures
 from icalib.data.images import DamagedImageError, DecodedImage, Payload, decode
 from icalib.data.measurements import Measurements
