@@ -16,10 +16,9 @@ from rich.console import Console
 from icalib.cli import main
 from icalib.data.recordings import FolderRecording, TopicInfo
 from icalib.geometry.targets import AprilGrid, Markers, Target
-from icalib.sensors.camera.inspect import empty_borders
-from icalib.sensors.camera.inspect.facts import CameraSource, camera_views, coverage, target_view
+from icalib.sensors.camera.inspect.facts import CameraSource, camera_views, target_view
 from icalib.tools.inspection import Inspection, inspect_recording, read_target
-from icalib.tools.inspection.console import print_inspection
+from icalib.tools.inspection.console import coverage, empty_borders, print_inspection
 from icalib.tools.inspection.facts import findings
 from icalib.tools.simulation import Imaging, Renderer, Sheet
 from icalib.tools.simulation.scenario import SimCamera

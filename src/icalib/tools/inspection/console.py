@@ -6,9 +6,11 @@ The same as a page with plots and images. Figures of an inspection as plain data
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.measure import Measurement
 from rich.padding import Padding
@@ -190,3 +192,43 @@ def _target(inspection: Inspection) -> dict[str, Any] | None:
     target = inspection.target.target
     fields = {"type": target.type, "targets": target.plain()} if isinstance(target, Scene) else target.plain()
     return fields | {"file": inspection.target.file}
+
+
+# Coverage of an image by the corners of a target.
+
+GRID = (8, 5)  # columns and rows of cells over the image
+EMPTY_EDGE = 0.5  # an edge of the image counts as empty if a larger share of its cells is
+
+
+def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
+    """Number of corners uv (N, 2) [px] in each cell of an image of `resolution` (width, height): GRID[1] rows of
+    GRID[0] cells."""
+    cell = np.floor((uv + 0.5) / resolution * GRID).astype(np.int64)
+    col, row = np.clip(cell, 0, np.array(GRID) - 1).T
+    counts = np.bincount(row * GRID[0] + col, minlength=GRID[0] * GRID[1]).reshape(GRID[1], GRID[0])
+    return tuple(tuple(int(n) for n in line) for line in counts)
+
+
+def empty_borders(cells: Sequence[Sequence[int]]) -> tuple[str, ...]:
+    """Names of empty image regions, such as "top edge": edges along which most cells are empty, and empty corners on
+    the remaining edges. cells: number of target corners in each cell, row by row."""
+    grid = np.array(cells)
+    edges = {"top": grid[0], "bottom": grid[-1], "left": grid[:, 0], "right": grid[:, -1]}
+    empty = [name for name, line in edges.items() if (line == 0).mean() > EMPTY_EDGE]
+    corners = [
+        f"{rows} {cols} corner"
+        for rows, i in (("top", 0), ("bottom", -1))
+        for cols, j in (("left", 0), ("right", -1))
+        if grid[i, j] == 0 and rows not in empty and cols not in empty
+    ]
+    return (*(f"{name} edge" for name in empty), *corners)
+
+
+def coverage_map(cells: Sequence[Sequence[int]]) -> str:
+    """The grid of cells as lines of text."""
+    most = max(max(row) for row in cells) or 1
+    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in cells)
+
+
+def _digit(count: int, most: int) -> str:
+    return str(max(1, round(9 * count / most))) if count else "."

@@ -18,7 +18,6 @@ from icalib.report.figures import coverage
 from icalib.report.page import Plot
 from icalib.report.pictures import Drawing, squares
 from icalib.sensors.camera.inspect.facts import (
-    GRID,
     CameraFacts,
     CameraSource,
     TargetView,
@@ -35,7 +34,7 @@ from icalib.sensors.camera.inspect.facts import (
 from icalib.sensors.camera.read import CameraInfo, read_camera_info
 from icalib.sensors.camera.spec import Camera
 from icalib.sensors.sensor import Sensor
-from icalib.tools.inspection.console import plain_table
+from icalib.tools.inspection.console import GRID, coverage_map, empty_borders, plain_table
 from icalib.tools.inspection.facts import (
     Draft,
     Facts,
@@ -63,7 +62,6 @@ LEAST_SHARE = 0.3  # share of images with the target
 FEWEST_IMAGES, SLOWEST_IMAGES_HZ = 21, 0.5  # with an IMU or wheels: 20 pairs of images at most 2 s apart
 FEWEST_STILLS, FEW_STILLS = 2, 10  # cameras alone: images to estimate a lens at all, and to estimate it well
 FLAT_DEG = 15.0  # a warning is given if the 90th percentile of the tilt is below
-EMPTY_EDGE = 0.5  # an edge of the image counts as empty if a larger share of its cells is
 
 
 def refused(inspection: Inspection) -> Iterator[Finding]:
@@ -231,21 +229,6 @@ def _view(v: TargetView) -> Iterator[Finding]:
             f"{v.camera} sees the target nearly from the front only (tilts up to about {v.tilt_deg[2]:.0f} "
             "deg); tilt it by up to 45 deg, or the focal length is weakly determined.",
         )
-
-
-def empty_borders(cells: tuple[tuple[int, ...], ...]) -> tuple[str, ...]:
-    """Names of empty image regions, such as "top edge": edges along which most cells are empty, and empty corners on
-    the remaining edges. cells: number of target corners in each cell, row by row."""
-    grid = np.array(cells)
-    edges = {"top": grid[0], "bottom": grid[-1], "left": grid[:, 0], "right": grid[:, -1]}
-    empty = [name for name, line in edges.items() if (line == 0).mean() > EMPTY_EDGE]
-    corners = [
-        f"{rows} {cols} corner"
-        for rows, i in (("top", 0), ("bottom", -1))
-        for cols, j in (("left", 0), ("right", -1))
-        if grid[i, j] == 0 and rows not in empty and cols not in empty
-    ]
-    return (*(f"{name} edge" for name in empty), *corners)
 
 
 class CameraInspector(KindInspector):
@@ -445,13 +428,3 @@ def coverage_maps(inspection: Inspection) -> Iterator[Text]:
         if view.cells:
             yield Text(f"Corners over the image of {name} (. none, 1 to 9 the share of the fullest cell):")
             yield Text(coverage_map(view.cells))
-
-
-def coverage_map(cells: tuple[tuple[int, ...], ...]) -> str:
-    """The grid of cells as lines of text."""
-    most = max(max(row) for row in cells) or 1
-    return "\n".join("  " + " ".join(_digit(n, most) for n in row) for row in cells)
-
-
-def _digit(count: int, most: int) -> str:
-    return str(max(1, round(9 * count / most))) if count else "."

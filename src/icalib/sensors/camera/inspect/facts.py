@@ -25,6 +25,7 @@ from icalib.sensors.camera.read import CameraInfo
 from icalib.sensors.camera.read import corners as recorded_corners
 from icalib.sensors.camera.read.detected_corners import find_corners
 from icalib.sensors.camera.spec import Camera
+from icalib.tools.inspection.console import coverage
 from icalib.tools.inspection.facts import (
     PICTURED,
     Inspection,
@@ -182,7 +183,6 @@ class _Sample:
         self.resolution = self.resolution or (width, height)
 
 
-GRID = (8, 5)  # columns and rows of cells over the image
 _LEAST_CORNERS = 8  # for the tilt of a board in one image; a free tag needs its four
 
 
@@ -250,15 +250,6 @@ def target_in(images: Iterable[np.ndarray]) -> str:
     """Words on the tags or the checkerboard in images (h, w) uint8; "" for neither."""
     grey = list(images)
     return tags_in(grey) or checkerboard_in(grey)
-
-
-def coverage(uv: np.ndarray, resolution: tuple[int, int]) -> tuple[tuple[int, ...], ...]:
-    """Number of corners uv (N, 2) [px] in each cell of an image of `resolution` (width, height): GRID[1] rows of
-    GRID[0] cells."""
-    cell = np.floor((uv + 0.5) / resolution * GRID).astype(np.int64)
-    col, row = np.clip(cell, 0, np.array(GRID) - 1).T
-    counts = np.bincount(row * GRID[0] + col, minlength=GRID[0] * GRID[1]).reshape(GRID[1], GRID[0])
-    return tuple(tuple(int(n) for n in line) for line in counts)
 
 
 def _poses(corners: CornerStream, target: Target) -> tuple[tuple[float, float, float] | None, float | None]:
