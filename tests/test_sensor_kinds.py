@@ -31,6 +31,7 @@ NAMING = {
     "rig/__init__.py",  # the names of sensors, for users
     "rig/rig.py",  # shorthand, for users
     "result/saving.py",  # records of residuals that it saves
+    "tools/inspection/follow.py",  # the target in images, and rotation by the IMU
     "tools/allan/analysis.py",  # the noise of IMUs
     "tools/simulation/filming.py",
     "tools/simulation/rigs.py",

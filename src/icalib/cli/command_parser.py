@@ -92,3 +92,11 @@ def count(text: str) -> int:
     if nonnegative_int(text) == 0:
         raise argparse.ArgumentTypeError("must be at least 1, but is 0")
     return int(text)
+
+
+def address(text: str) -> tuple[str, int]:
+    """`type` of an option with an address, PORT or HOST:PORT. Raises ArgumentTypeError."""
+    host, _, port = text.rpartition(":")
+    if not (port.isdecimal() and int(port) < 65536):
+        raise argparse.ArgumentTypeError(f"must be PORT or HOST:PORT, as in 8765, but is {text!r}")
+    return host or "127.0.0.1", int(port)

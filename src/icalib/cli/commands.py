@@ -9,9 +9,19 @@ import os
 import sys
 import traceback
 import warnings
+from math import inf
 from pathlib import Path
 
-from icalib.cli.command_parser import CommandParser, add_command, add_part, count, examples, file_path, nonnegative_int
+from icalib.cli.command_parser import (
+    CommandParser,
+    add_command,
+    add_part,
+    address,
+    count,
+    examples,
+    file_path,
+    nonnegative_int,
+)
 from icalib.cli.result_commands import add_result_commands, add_target_command
 from icalib.errors import CalibrationError
 
@@ -142,6 +152,7 @@ def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
         about,
         "icalib inspect run.bag",
         "icalib inspect run.bag --target aprilgrid.yaml --rig rig.yaml",
+        "icalib inspect run.mcap --target rig.yaml --follow --serve",
     )
     c.add_argument("recording", type=file_path, help="bag or folder of the recording")
     c.add_argument(
@@ -151,6 +162,10 @@ def _add_inspect(commands: argparse._SubParsersAction[CommandParser]) -> None:
     c.add_argument("--target", type=file_path, metavar="FILE", help=target)
     c.add_argument("--json", type=file_path, metavar="FILE", help="write the results of the inspection as JSON")
     c.add_argument("--html", type=file_path, metavar="FILE", help="write them as a page with plots and images")
+    live = "follow the recording while it is written, until Ctrl-C; give --target for predictions"
+    c.add_argument("--follow", action="store_true", help=live)
+    page = "with --follow: show it on a local page, too; default: 127.0.0.1:8765"
+    c.add_argument("--serve", type=address, nargs="?", const=("127.0.0.1", 8765), metavar="[HOST:]PORT", help=page)
     add_part(c)
     c.add_argument("--quiet", "-q", action="store_true", help="print no progress and no table")
     c.set_defaults(run=_inspect)
@@ -320,6 +335,8 @@ def _fleet(options: argparse.Namespace) -> int:
 
 
 def _inspect(options: argparse.Namespace) -> None:
+    if options.follow or options.serve:
+        return _follow(options)
     from icalib.base.files import printable, refuse_existing, refuse_foreign, write_new, write_sealed
     from icalib.cli.console import console_progress
     from icalib.tools.inspection import draft_rig, inspect_recording, read_target
@@ -348,3 +365,14 @@ def _inspect(options: argparse.Namespace) -> None:
         write_new(options.rig, draft_rig(inspection))
         if not options.quiet:
             print(f"Wrote {options.rig}, a draft: check it, and fill in what is missing.")
+
+
+def _follow(options: argparse.Namespace) -> None:
+    if not options.follow:
+        raise CalibrationError("--serve shows a recording that is being written; give --follow as well.")
+    if options.rig or options.json or options.html or (options.start_s, options.end_s) != (0.0, inf):
+        raise CalibrationError("--follow takes --target and --serve only; inspect the recording once it is complete.")
+    from icalib.tools.inspection import read_target
+    from icalib.tools.inspection.follow import follow
+
+    follow(options.recording, read_target(options.target) if options.target else None, options.serve)

@@ -8,8 +8,10 @@ import struct
 import tempfile
 import weakref
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence, Set
+from dataclasses import dataclass, field, replace
 from functools import cache
+from itertools import chain
 from pathlib import Path
 from typing import Any, final
 
@@ -23,6 +25,7 @@ from icalib.data.bags import (
     MCAP_MAGIC,
     ROS1_MAGIC,
     SQLITE_MAGIC,
+    Connection,
     McapStorage,
     Ros1Storage,
     SqliteStorage,
@@ -31,7 +34,7 @@ from icalib.data.bags import (
 )
 from icalib.data.images import Payload, checked_payloads, file_payload
 from icalib.data.messages import MessageType, TopicInfo, choose_topic, find_topic, message_types
-from icalib.data.recording import Recording
+from icalib.data.recording import PART_BYTES, NewPart, Recording
 from icalib.data.stamps import WHOLE_RECORDING, Span, Window
 from icalib.errors import RecordingError, RigError
 from icalib.sensors.sensor import Sensor
@@ -45,9 +48,10 @@ class BagRecording(Recording):
 
     has_messages = True
 
-    def __init__(self, root: Path, window: Window = WHOLE_RECORDING) -> None:
+    def __init__(self, root: Path, window: Window = WHOLE_RECORDING, storages: Sequence[Storage] | None = None) -> None:
+        """storages: of the messages; None: the files at `root` are opened."""
         super().__init__(root, window)
-        self._storages, self._notes = open_storages(root)
+        self._storages, self._notes = open_storages(root) if storages is None else ([*storages], [])
         self._topics = self._list_topics()
         self._received = self._received_ns()
         self._times: dict[TopicInfo, array[int]] = {}
@@ -332,6 +336,19 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
     )
 
 
+def open_growing(path: Path) -> McapStorage | Ros1Storage | SqliteStorage | None:
+    """Reader of the bag file `path`, which is being written; None while its first bytes are not there. Raises
+    RecordingError if it is no bag, OSError if it cannot be read."""
+    with path.open("rb") as file:
+        head = file.read(HEAD_BYTES)
+    for magic, reader in _READERS.items():
+        if head.startswith(magic):
+            return reader(path, path, growing=True)
+    if len(head) < HEAD_BYTES:
+        return None
+    raise RecordingError(f"{path} is no bag that can be followed; give a .bag, .mcap or .db3 file, or a folder.")
+
+
 def _open_compressed(path: Path) -> Storage:
     """Reader of a file that ROS 2 compressed as a whole. It reads a temporary copy, deleted with the reader."""
     zstd = load_zstd()
@@ -368,3 +385,70 @@ def _absent(folder: Path) -> list[str]:
         return []
     present = {path.name for path in folder.iterdir()}
     return [n for n in names if not {n, n + ".zstd"} & present]
+
+
+# Bags that are being written.
+
+
+@dataclass
+class MessagePart(NewPart):
+    """Messages of a bag, as a `Storage`: connection, receive time [ns], content. connections: all that are known."""
+
+    name: Path
+    connections: dict[int, Connection]
+    rows: list[tuple[int, int, bytes]]
+    notes: list[Remark] = field(default_factory=list)
+
+    def tally(self) -> dict[int, Tally]:
+        total: dict[int, Tally] = {}
+        for key, received_ns, _ in self.rows:
+            total.setdefault(key, Tally()).add(1, received_ns, received_ns)
+        return total
+
+    def messages(self, wanted: Set[int]) -> Iterator[tuple[int, int, bytes]]:
+        return (row for row in self.rows if row[0] in wanted)
+
+    def recording(self, folder: Path) -> BagRecording:
+        return BagRecording(self.name, storages=[self])
+
+    def without(self, topics: Set[str]) -> MessagePart:
+        kinds = {key: message_types().get(connection.type) for key, connection in self.connections.items()}
+        left = {k for k, c in self.connections.items() if c.topic in topics or ((t := kinds[k]) and t.kind == "image")}
+        return replace(self, rows=[row for row in self.rows if row[0] not in left])
+
+    def joined(self, others: Sequence[MessagePart]) -> MessagePart:
+        parts = (self, *others)
+        return replace(parts[-1], rows=[row for part in parts for row in part.rows])
+
+
+class GrowingBag:
+    """A bag file that is being written, or a folder to which bag files are added."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._storages: dict[Path, McapStorage | Ros1Storage | SqliteStorage] = {}
+        self._keys: dict[Connection, int] = {}  # numbers of connections in all files
+        self._rows: Iterator[tuple[int, int, bytes]] = iter(())
+
+    def part(self) -> MessagePart | None:
+        """See `Growing`."""
+        rows: list[tuple[int, int, bytes]] = []
+        size = 0
+        self._rows = chain(self._rows, self._new_rows())
+        for row in self._rows:
+            rows.append(row)
+            size += len(row[2])
+            if size > PART_BYTES:
+                break
+        else:
+            self._rows = iter(())
+        return MessagePart(self._root, {n: c for c, n in self._keys.items()}, rows) if rows else None
+
+    def _new_rows(self) -> Iterator[tuple[int, int, bytes]]:
+        """Messages of all files since the last look. Copies that the recorder compressed as a whole are left out."""
+        for path in bag_files(self._root) if self._root.is_dir() else [self._root]:
+            if path.suffix != ".zstd" and path not in self._storages and (opened := open_growing(path)) is not None:
+                self._storages[path] = opened
+            if (storage := self._storages.get(path)) is not None:
+                for key, received_ns, content in storage.grown():
+                    yield self._keys.setdefault(storage.connections[key], len(self._keys)), received_ns, content

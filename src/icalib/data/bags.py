@@ -9,7 +9,7 @@ import zlib
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Set
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, final
@@ -117,15 +117,19 @@ class Span:
 
 class SpanStorage(ABC):
     """Reader of a file of blocks. It finds blocks sequentially, without the index at the end of the file. A truncated
-    file is thus read by the same code, up to the truncation."""
+    file is thus read by the same code, up to the truncation. growing: the file is being written; only `grown` reads."""
 
-    def __init__(self, path: Path, name: Path) -> None:
+    def __init__(self, path: Path, name: Path, growing: bool = False) -> None:
         self.path = path
         self.name = name
         self.connections: dict[int, Connection] = {}
         self.notes: list[Remark] = []
-        self._hash = hash_of(path)
+        self.growing = growing
+        self._hash = None if growing else hash_of(path)
+        self._scanned = 0  # bytes up to the end of the last complete record
         self.spans: list[Span] = []
+        if growing:
+            return
         with path.open("rb") as file:
             size = path.stat().st_size
             cut = self._scan_to_the_end(file, size)
@@ -137,9 +141,20 @@ class SpanStorage(ABC):
         if self.notes and not self.tally():
             raise RecordingError(self.notes[0])
 
+    def grown(self) -> Iterator[tuple[int, int, bytes]]:
+        """Messages as by `messages`, of all connections, in blocks that were completed since the last call."""
+        with self.path.open("rb") as file:
+            self.spans = []
+            with suppress(DamageError):  # the end of what is written so far
+                self._scan(file, self.path.stat().st_size)
+            for span in self.spans:
+                if span.offset + span.size <= self._scanned:
+                    for connection, received_ns, content in self._messages_of(file, span):
+                        yield connection, received_ns, bytes(content)
+
     @abstractmethod
     def _scan(self, file: BinaryIO, size: int) -> None:
-        """Find the blocks of a file of `size` bytes, and connections outside of blocks.
+        """Find the blocks of a file of `size` bytes after byte `_scanned`, and connections outside of blocks.
 
         Raises DamageError if the file is truncated or damaged, with `file` positioned there.
         """
@@ -185,7 +200,8 @@ class SpanStorage(ABC):
         """Unpacked records of a block; of a truncated block, as far as it can be unpacked. Raises DamageError."""
         file.seek(span.offset)
         stored = file.read(span.size)
-        self._hash.saw(span.offset, stored, file)
+        if self._hash is not None:
+            self._hash.saw(span.offset, stored, file)
         body = stored if span.compression in ("", "none") else _decompress(stored, span.compression)
         if span.crc and zlib.crc32(body) != span.crc:
             raise DamageError
@@ -248,9 +264,11 @@ class McapStorage(SpanStorage):
 
     def _scan(self, file: BinaryIO, size: int) -> None:
         """See `SpanStorage`. A truncated chunk is noted, too, as its first messages can be read."""
-        self._schemas: dict[int, str] = {}
+        if not self._scanned:
+            self._schemas: dict[int, str] = {}
+            self._scanned = len(MCAP_MAGIC)
         self._run: Span | None = None  # current block of messages outside of chunks
-        file.seek(len(MCAP_MAGIC))
+        file.seek(self._scanned)
         while (at := file.tell()) < size:
             try:
                 kind, length = _RECORD.unpack(file.read(_RECORD.size))
@@ -266,7 +284,7 @@ class McapStorage(SpanStorage):
             if begin + length > size:
                 file.seek(size)
                 raise DamageError
-            file.seek(begin + length)
+            self._scanned = file.seek(begin + length)
         raise DamageError  # no footer: the file is truncated
 
     def _note_record(self, kind: int, file: BinaryIO, at: int, length: int) -> None:
@@ -345,6 +363,7 @@ def _text(content: memoryview, at: int) -> tuple[str, int]:
 # Reader of SQLite bags of ROS 2 (.db3).
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
+_ROWS_AT_A_TIME = 64  # that `grown` holds in memory: 60 MB of images of 1 MB
 # Types are checked, as a damaged database may contain any value.
 _TOPICS = (
     "SELECT id, name, type, serialization_format FROM topics WHERE typeof(name) = 'text' AND typeof(type) = 'text'"
@@ -353,14 +372,19 @@ _TOPICS = (
 
 @final
 class SqliteStorage:
-    """Reader of a ROS 2 database. Rows are read in the order of ids, the order of writing, without an index."""
+    """Reader of a ROS 2 database. Rows are read in the order of ids, the order of writing, without an index. growing:
+    the file is being written; only `grown` reads."""
 
-    def __init__(self, path: Path, name: Path) -> None:
+    def __init__(self, path: Path, name: Path, growing: bool = False) -> None:
         self.path = path
         self.name = name
         self.notes: list[Remark] = []
         self._tally: dict[int, Tally] = {}
         self._last_id = -1  # id of the last usable message
+        self._newest_id = -1  # id of the last message at the last call of `grown`
+        self.connections: dict[int, Connection] = {}
+        if growing:
+            return
         try:
             with closing(self._connect()) as database:
                 rows = database.execute(_TOPICS).fetchall()
@@ -368,7 +392,7 @@ class SqliteStorage:
             raise RecordingError(f"{name} is a database, but not a ROS 2 bag ({error}); check the path.") from error
         except sqlite3.DatabaseError as error:
             raise RecordingError(f"{name} is a damaged database ({error}); copy or record it again.") from error
-        self.connections = {key: Connection(topic, full_type(kind), form) for key, topic, kind, form in rows}
+        self.connections = _connections(rows)
         self._count()
 
     def tally(self) -> dict[int, Tally]:
@@ -386,6 +410,20 @@ class SqliteStorage:
                 note = Remark("bag_damaged", sentence)
                 if note not in self.notes:
                     self.notes.append(note)
+
+    def grown(self) -> Iterator[tuple[int, int, bytes]]:
+        """Messages as by `messages`, of all connections, since the last call. The newest ones are left to the next
+        call: without locks, which would stop the writer, they may be read half written."""
+        query = "SELECT topic_id, timestamp, data, id FROM messages WHERE id > ? AND id <= ? ORDER BY id LIMIT ?"
+        with suppress(sqlite3.DatabaseError), closing(self._connect()) as database:
+            self.connections = _connections(database.execute(_TOPICS).fetchall())
+            until, self._newest_id = (
+                self._newest_id,
+                database.execute("SELECT max(id) FROM messages").fetchone()[0] or -1,
+            )
+            while rows := database.execute(query, (self._last_id, until, _ROWS_AT_A_TIME)).fetchall():
+                yield from (row[:3] for row in rows if isinstance(row[2], bytes))
+                self._last_id = rows[-1][3]
 
     def _count(self) -> None:
         page_bytes = _page_bytes_of_cut(self.path)
@@ -430,6 +468,10 @@ class SqliteStorage:
         return database
 
 
+def _connections(rows: list[tuple[int, str, str, str]]) -> dict[int, Connection]:
+    return {key: Connection(topic, full_type(kind), form) for key, topic, kind, form in rows}
+
+
 def _page_bytes_of_cut(path: Path) -> int:
     """Page size [bytes] if the database file is truncated (shorter than its header states), else 0."""
     with path.open("rb") as file:
@@ -457,8 +499,9 @@ class Ros1Storage(SpanStorage):
     """Reader of a ROS 1 bag."""
 
     def _scan(self, file: BinaryIO, size: int) -> None:
-        if file.read(len(_VERSION)) != _VERSION:
+        if not self._scanned and file.read(len(_VERSION)) != _VERSION:
             raise RecordingError(f"{self.name} is a bag older than format 2.0; convert it with `rosbag fix`.")
+        file.seek(self._scanned or len(_VERSION))
         index_at = 0
         while (at := file.tell()) < size:
             try:
@@ -468,14 +511,16 @@ class Ros1Storage(SpanStorage):
                     self._refuse_encrypted(fields)
                     index_at = _number("<Q", fields, b"index_pos")
                 self._note_record(kind, fields, file, min(length, size - file.tell()))
-                complete = file.tell() + length <= size
+                # The recorder writes the size of a chunk when it closes the chunk.
+                is_open = self.growing and kind == _ROS1_CHUNK and not length
+                complete = file.tell() + length <= size and not is_open
             except (struct.error, KeyError, UnicodeDecodeError) as error:
                 file.seek(at)
                 raise DamageError from error
             if not complete:
                 file.seek(size)
                 raise DamageError
-            file.seek(length, 1)
+            self._scanned = file.seek(length, 1)
         if not 0 < index_at <= size:  # position of the index, which the recorder writes last
             raise DamageError
 

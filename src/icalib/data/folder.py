@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
+import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import astuple, replace
+from collections.abc import Iterator, Sequence, Set
+from dataclasses import astuple, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import final
@@ -32,7 +33,7 @@ from icalib.data.images import (
     videos_in,
 )
 from icalib.data.messages import TopicInfo, choose_topic, find_topic, type_not_read
-from icalib.data.recording import Recording
+from icalib.data.recording import PART_BYTES, NewPart, Recording
 from icalib.data.stamps import WHOLE_RECORDING, Window
 from icalib.data.tables import (
     StampsOfRows,
@@ -406,3 +407,80 @@ def _patterns(paths: list[Path], place: int) -> dict[str, set[int]]:
         else:
             patterns.setdefault(path.name, set()).add(0)
     return patterns
+
+
+# Folders that are being written.
+
+_HEADER = re.compile(rb"(?:[^\n]*[^\n\d.,;eE+\s-][^\n]*\n)?")  # the first line, if it has more than numbers
+_SETTLED_S = 0.3  # after which an image file counts as complete
+
+
+@dataclass
+class FilePart(NewPart):
+    """Rows of tables and images of a folder. tables: header and rows by path in the folder; images: files by path."""
+
+    tables: dict[str, tuple[bytes, bytes]]
+    images: dict[str, Path]
+
+    def recording(self, folder: Path) -> FolderRecording:
+        for name, (header, rows) in self.tables.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).write_bytes(header + rows)
+        for name, file in self.images.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (folder / name).symlink_to(file.absolute())
+        return FolderRecording(folder)
+
+    def without(self, topics: Set[str]) -> FilePart:
+        return FilePart({name: table for name, table in self.tables.items() if name not in topics}, {})
+
+    def joined(self, others: Sequence[FilePart]) -> FilePart:
+        tables: dict[str, tuple[bytes, list[bytes]]] = {}
+        for name, (header, rows) in (item for part in (self, *others) for item in part.tables.items()):
+            tables.setdefault(name, (header, []))[1].append(rows)
+        return FilePart({name: (header, b"".join(rows)) for name, (header, rows) in tables.items()}, {})
+
+
+class GrowingFolder:
+    """A folder to which images, named by stamps in ns, and rows of tables are added."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self._tables: dict[str, tuple[bytes, int]] = {}  # header, and number of bytes that were read
+        self._newest: dict[Path, int] = {}  # stamp of the newest image that was read, by folder
+
+    def part(self) -> FilePart | None:
+        """See `Growing`."""
+        images, tables = self._new_images(), {}
+        filmed = {folder.parent for folder in self._newest}
+        for path in sorted(p for pattern in ("*.csv", "*/*.csv", "mav0/*/*.csv") for p in self._root.glob(pattern)):
+            if not (path.name in _OF_IMAGES and path.parent in filmed) and (rows := self._new_rows(path)):
+                name = str(path.relative_to(self._root))
+                tables[name] = self._tables[name][0], rows
+        return FilePart(tables, images) if tables or images else None
+
+    def _new_rows(self, path: Path) -> bytes:
+        """Complete rows of a table since the last look."""
+        name = str(path.relative_to(self._root))
+        header, done = self._tables.get(name, (b"", 0))
+        with path.open("rb") as file:
+            file.seek(done)
+            rows = file.read(PART_BYTES)
+        rows = rows[: rows.rfind(b"\n") + 1]
+        if not done and (first := _HEADER.match(rows)):
+            header = first[0]
+        self._tables[name] = header, done + len(rows)
+        return rows if done else rows[len(header) :]
+
+    def _new_images(self) -> dict[str, Path]:
+        """Images since the last look, by path in the folder."""
+        images: dict[str, Path] = {}
+        for folder in (p for pattern in ("*", "*/data", "mav0/*/data") for p in self._root.glob(pattern) if p.is_dir()):
+            named = ((int(p.stem), p) for p in pictures_in(folder) if p.stem.isdecimal())
+            new = sorted(pair for pair in named if pair[0] > self._newest.get(folder, -1))
+            while new and time.time() - new[-1][1].stat().st_mtime < _SETTLED_S:
+                new.pop()
+            if new:
+                self._newest[folder] = new[-1][0]
+            images |= {str(p.relative_to(self._root)): p for _, p in new}
+        return images

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -160,6 +160,31 @@ class Recording(ABC):
         return stamps_inside(self.window, stamps_ns, where, self._spans())
 
 
+class NewPart(ABC):
+    """What was recorded between two looks at a recording that is being written. Parts can be pickled and joined."""
+
+    @abstractmethod
+    def recording(self, folder: Path) -> Recording:
+        """The part as a recording; folder: an empty one, for the files that it may need."""
+
+    @abstractmethod
+    def without(self, topics: Set[str]) -> NewPart:
+        """A copy without these topics, and without all images."""
+
+    @abstractmethod
+    def joined(self, others: Sequence[Any]) -> NewPart:
+        """This part and `others` of the same class, which follow it."""
+
+
+class Growing(Protocol):
+    """A recording that is being written. Reading it writes nothing, and locks nothing."""
+
+    def part(self) -> NewPart | None:
+        """What is new, up to PART_BYTES; None if nothing is. Raises OSError and RecordingError."""
+        ...
+
+
+PART_BYTES = 32 << 20
 ReadStream = tuple[Stream, tuple[Remark, ...]]  # stream, notes on it
 Progress = Callable[[str, float], None]  # called with the stage and the completed fraction, 0 to 1
 

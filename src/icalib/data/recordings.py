@@ -11,12 +11,12 @@ from math import inf
 from pathlib import Path
 
 from icalib.base.files import HEAD_BYTES, is_video, not_data
-from icalib.data.bag_recording import BagRecording, bag_files
-from icalib.data.folder import FolderRecording, PictureFolder, has_pictures
+from icalib.data.bag_recording import BagRecording, GrowingBag, bag_files
+from icalib.data.folder import FolderRecording, GrowingFolder, PictureFolder, has_pictures
 from icalib.data.images import DamagedImageError, DecodedImage, Payload, decode
 from icalib.data.measurements import Measurements
 from icalib.data.messages import TopicInfo
-from icalib.data.recording import Progress, Reading, Recording
+from icalib.data.recording import Growing, Progress, Reading, Recording
 from icalib.data.stamps import LONGEST_S, ClockJumps, S, Window
 from icalib.data.tables import named_tables, table_files
 from icalib.errors import CalibrationError, RecordingError
@@ -69,6 +69,13 @@ def open_recording(path: str | Path, start_s: float = 0.0, end_s: float = inf) -
     beside = sorted(p.name for p in parent.iterdir())[:_MAX_LISTED] if parent.is_dir() else []
     listing = f"{parent} holds {', '.join(beside)}" if beside else f"{parent} is empty or missing"
     raise RecordingError(f"{root} does not exist; {listing}; check the path of the recording.")
+
+
+def open_growing_recording(path: Path) -> Growing | None:
+    """The recording that is being written at `path`; None while nothing is there."""
+    if path.is_file() or (path.is_dir() and bag_files(path)):
+        return GrowingBag(path)
+    return GrowingFolder(path) if path.is_dir() and any(path.iterdir()) else None
 
 
 def _refuse_unreadable(folder: Path) -> None:

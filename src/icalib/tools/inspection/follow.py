@@ -1,0 +1,700 @@
+"""Follows a recording that is being written: what has arrived, how good a calibration would be, and what to do next.
+
+What is new is read in small parts, each a recording of its own for the readers of all kinds. The last minutes are
+calibrated coarsely in a process of their own, over and over; standard deviations of the whole follow from that.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from html import escape
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from importlib.resources import files
+from math import inf
+from multiprocessing.connection import Connection
+from pathlib import Path
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from rich.console import Console, Group
+from rich.live import Live
+from rich.text import Text
+
+from icalib.data.measurements import CornerStream, ImuStream, Measurements
+from icalib.data.messages import TopicInfo, choose_topic
+from icalib.data.recording import Growing, NewPart
+from icalib.data.recordings import DamagedImageError, Recording, decode, open_growing_recording, read_measurements
+from icalib.detection.decoding import ImageCorners, corner_stream
+from icalib.detection.detectors import detector_of
+from icalib.detection.images import number_continuously, without_rare_tags
+from icalib.errors import CalibrationError, RecordingError
+from icalib.geometry.targets import Scene
+from icalib.kinds import inspectors
+from icalib.pipeline import calibrate_measurements
+from icalib.result import ParameterGroup
+from icalib.rig import ImuSensor, Rig, Sensor
+from icalib.rig.file import load_rig, rig_from_dict
+from icalib.sensors.camera.read.detected_corners import checked_corners
+from icalib.sensors.imu.read import in_si
+from icalib.sensors.imu.read import readings as imu_readings
+from icalib.sensors.imu.spec import DEFAULT_CLASS, class_noise
+from icalib.sensors.parameter import display_unit
+from icalib.sensors.sensor import MOUNTED_NAMES, TIME_OFFSET
+from icalib.tools.batch import sentence_on
+from icalib.tools.inspection import find_sources
+from icalib.tools.inspection.console import GRID, coverage, coverage_map, empty_borders, plain_table
+from icalib.tools.inspection.facts import GivenTarget
+
+LOOK_EVERY_S = 0.2
+WINDOW_S = 120.0  # recorded time of a coarse problem; memory, and the time of a solve, are proportional to it
+SEARCH_HZ = 10.0  # images of a camera that are searched; standard deviations of all are extrapolated from these
+SEARCH_SHARE = 0.25  # of a core, at most, for the search of images
+SLOWEST_SEARCH_S = 0.5  # of an image, as far as SEARCH_SHARE counts it: the first one waits for its compiled code
+SOLVE_SHARE = 0.2  # of a core, at most, for solves
+RECENT = 100  # stamps from which a rate is computed
+FEWEST_VIEWS = 25  # images with the target before the first solve; a first guess needs 20 pairs
+SET_BACK_NS = 1_000_000_000  # a clock that goes back by more was set; what was before is then left out
+
+# The coarse problem. It runs in a process of its own.
+
+
+@dataclass(frozen=True)
+class CoarseProblem:
+    """What a solve needs. parts: of the last minutes, without images; corners: of the searched images of each camera.
+
+    density: recorded images over those that were searched. share: recorded time of `parts` over that of the whole
+    recording, which lasts `seconds`.
+    """
+
+    rig: Rig
+    parts: tuple[NewPart, ...]
+    corners: tuple[CornerStream, ...]
+    density: float
+    share: float
+    seconds: float
+
+
+@dataclass(frozen=True)
+class ExpectedStd:
+    """Standard deviation of one number of a calibration, from all that is recorded so far. unit: SI; std: infinite if
+    the motion so far does not show it. needed_s: seconds more until `std` is `tolerance`, if the motion goes on; 0: it
+    is determined."""
+
+    sensor: str
+    group: str
+    label: str
+    unit: str
+    std: float
+    tolerance: float
+    needed_s: float
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """Outcome of a coarse problem. stds: of extrinsics, time offsets and lenses; rotations: R_imu_sensor of each
+    sensor; hidden: sentences on combinations that the motion does not show; problem: why there is no outcome.
+    seconds: recorded time that it holds for."""
+
+    seconds: float
+    stds: tuple[ExpectedStd, ...] = ()
+    rotations: Mapping[str, np.ndarray] = field(default_factory=dict)
+    hidden: tuple[str, ...] = ()
+    problem: str = ""
+
+
+def predict(problem: CoarseProblem) -> Expectation:
+    """Calibrates the coarse problem, and once more with half of its images.
+
+    The formal variance is a + b / n for n images, as the noise of the other sensors limits how much more images help; a
+    and b follow from the two solves, and give the variance for all recorded images. Segments scatter more than that
+    because errors of corners are alike in images that follow one another: what the squared empirical factor has above 1
+    is proportional to the rate of the images. All variances fall with the length of the recording.
+    """
+    rig = problem.rig.with_("settings", images_in_report=False)
+    try:
+        measured = _measurements(problem, rig)
+        whole = calibrate_measurements(rig, measured)
+        half = measured.with_streams(*(_every_second(c) for c in measured.cameras))
+        halved = calibrate_measurements(rig.with_("settings", segments=0), half) if problem.density > 1.0 else whole
+    except Exception as error:  # the recording goes on, and another minute may be fit
+        return Expectation(problem.seconds, problem=sentence_on(error))
+    groups = [g for g in whole.groups if g.sensor in rig.sensors and g.mode != "fixed"]
+    groups = [g for g in groups if g.name in (*MOUNTED_NAMES, "intrinsics") and g.unit and g.std_formal.all()]
+    stds = [std for g in groups for std in _expected(problem, g, halved.group_or_none(g.sensor, g.name))]
+    turned = {g.sensor: g.value for g in whole.groups if g.name == "rotation"}
+    return Expectation(problem.seconds, tuple(stds), turned, tuple(map(str, whole.unobservable)))
+
+
+def _expected(problem: CoarseProblem, g: ParameterGroup, halved: ParameterGroup | None) -> Iterator[ExpectedStd]:
+    """Standard deviations of a group, from those of the coarse problem and of its half."""
+    variance = g.std_formal**2
+    of_half = variance if halved is None else halved.std_formal**2
+    by_images = np.clip(of_half - variance, 0.0, variance)
+    formal = variance - by_images + by_images / problem.density
+    excess = (g.std / g.std_formal) ** 2 - 1.0
+    std = np.sqrt(problem.share * formal * (1.0 + problem.density * excess))
+    sensor = problem.rig.sensors[g.sensor]
+    given = sensor.spec(g.name).tolerance
+    tolerance = problem.rig.settings.tolerance(given) if isinstance(given, str) else given
+    for k, t in enumerate(np.broadcast_to(tolerance, std.shape).tolist()):
+        is_observable = g.verdict[k] != "undetermined"
+        needed = problem.seconds * max((std[k] / t) ** 2 - 1.0, 0.0) if is_observable else np.inf
+        yield ExpectedStd(
+            g.sensor, g.name, g.labels[k], g.unit, float(std[k]) if is_observable else np.inf, t, float(needed)
+        )
+
+
+def _measurements(problem: CoarseProblem, rig: Rig) -> Measurements:
+    """Measurements of the parts and the corners."""
+    others = rig.without(*(c.name for c in problem.corners))
+    sizes = {camera.name: camera.resolution for camera in rig.cameras}
+    corners = [checked_corners(c, c.name, sizes[c.name])[0] for c in problem.corners]
+    if not others.sensors:
+        return Measurements.of_streams(*corners)
+    with tempfile.TemporaryDirectory(prefix="icalib-") as folder:
+        first, *rest = problem.parts
+        recording = first.joined(rest).recording(Path(folder))
+        return read_measurements(recording, others).with_streams(*corners)
+
+
+def _every_second(c: CornerStream) -> CornerStream:
+    kept = np.arange(len(c.stamps_ns)) % 2 == 0
+    return c.of_rows(kept[c.image], c.stamps_ns[kept], np.diff(c.start)[kept])
+
+
+def _work(pipe: Connection) -> None:
+    """Solves each problem that comes, until the other end is closed. Sends the outcome, and its processor time [s]."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to all processes; the first one ends them
+    with suppress(EOFError, OSError):
+        pipe.send(None)
+        while True:
+            problem, begin = pipe.recv(), time.process_time()
+            pipe.send((predict(problem), time.process_time() - begin))
+
+
+class Solver:
+    """Solves coarse problems one at a time in a process of its own, with rests. latest: the last outcome."""
+
+    def __init__(self) -> None:
+        self.latest: Expectation | None = None
+        self._start()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._pipe, end = context.Pipe()
+        self._process = context.Process(target=_work, args=(end,), daemon=True)
+        self._process.start()
+        end.close()
+        self._is_idle, self._begun, self._free_at = False, time.monotonic(), 0.0
+
+    def offer(self, make: Callable[[], CoarseProblem | None]) -> None:
+        """Takes the outcome of a solve that has ended, and begins one if it is time."""
+        try:
+            if not self._is_idle and self._pipe.poll():
+                self._is_idle = True
+                if (answer := self._pipe.recv()) is not None:  # None: the process is ready
+                    self.latest, took = answer
+                    self._free_at = self._begun + took / SOLVE_SHARE
+            if self._is_idle and time.monotonic() >= self._free_at and (problem := make()) is not None:
+                self._begun, self._is_idle = time.monotonic(), False
+                self._pipe.send(problem)
+        except (EOFError, OSError):  # the process was killed, such as for lack of memory
+            self.close()
+            self._start()
+
+    def close(self) -> None:
+        """Ends the process."""
+        self._process.kill()
+        self._process.join()
+        self._pipe.close()
+
+
+# What has arrived.
+
+
+@dataclass
+class Arrivals:
+    """One topic. recent: its last stamps [ns]; arrived: when the last message came, by `time.monotonic`.
+
+    searched, seen: images that were searched, the last one at searched_ns, and those with the target; sees: whether the
+    last one had it. cells (rows, columns): number of corners over the image; size: (width, height) px, None before the
+    first image."""
+
+    topic: TopicInfo
+    recent: deque[int] = field(default_factory=lambda: deque(maxlen=RECENT))
+    arrived: float = 0.0
+    searching: float = 0.0  # processor time [s] that the search of images took
+    searched: int = 0
+    searched_ns: int = -(2**62)
+    seen: int = 0
+    sees: bool = False
+    cells: np.ndarray = field(default_factory=lambda: np.zeros(GRID[::-1], np.int64))
+    size: tuple[int, int] | None = None
+
+    def note(self, stamps_ns: Sequence[int]) -> float:
+        """Notes new stamps. Returns the recorded time [s] that they add, negative if the clock was set back."""
+        before = self.recent[-1] if self.recent else stamps_ns[0]
+        self.recent.extend(stamps_ns)
+        return 1e-9 * (stamps_ns[-1] - before)
+
+    @property
+    def rate_hz(self) -> float:
+        """From the median interval of the last stamps; 0 before the second one."""
+        steps = np.diff(np.array(self.recent, np.int64))
+        return float(1e9 / np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+
+
+@dataclass
+class Motion:
+    """Sums over the readings of the IMU. turning (3, 3): integral of w w^T [rad^2/s]; accel, accel2 (3,): sums of the
+    specific force and of its squares."""
+
+    seconds: float = 0.0
+    count: int = 0
+    turning: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+    accel: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    accel2: np.ndarray = field(default_factory=lambda: np.zeros(3))
+
+    def add(self, imu: ImuStream, rate_hz: float) -> None:
+        """Adds readings, which come at rate_hz."""
+        step = 1.0 / rate_hz if rate_hz else 0.0
+        self.seconds += step * len(imu.gyro)
+        self.count += len(imu.gyro)
+        self.turning += step * imu.gyro.T @ imu.gyro
+        self.accel += imu.accel.sum(axis=0)
+        self.accel2 += (imu.accel**2).sum(axis=0)
+
+    def rates(self, R_imu_sensor: np.ndarray) -> np.ndarray:
+        """(3,) RMS angular rate [rad/s] about the axes of a sensor."""
+        turning = R_imu_sensor.T @ self.turning @ R_imu_sensor
+        return np.sqrt(np.maximum(np.diag(turning), 0.0) / max(self.seconds, 1e-9))
+
+    def shaking(self) -> np.ndarray:
+        """(3,) RMS of the specific force about its mean [m/s^2], imu frame."""
+        mean = self.accel / max(self.count, 1)
+        return np.sqrt(np.maximum(self.accel2 / max(self.count, 1) - mean**2, 0.0))
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A part in memory: `part` without images and clouds, recorded seconds, and corners with stamps by camera."""
+
+    part: NewPart
+    seconds: float
+    corners: Mapping[str, Sequence[tuple[int, ImageCorners]]]
+
+
+class Follower:
+    """Everything that is known of a recording that is being written; `look` reads what is new. given: the target, and
+    the rig if its file is a rig file.
+
+    topics: by name; sensors: topic of each sensor, the reference first; problem: a sentence on what cannot be read, ""
+    if nothing; seconds: recorded time so far.
+    """
+
+    def __init__(self, root: Path, given: GivenTarget | None = None) -> None:
+        self.root = root
+        self.topics: dict[str, Arrivals] = {}
+        self.sensors: dict[str, TopicInfo] = {}
+        self.motion, self.seconds, self.problem = Motion(), 0.0, ""
+        self.target = None if given is None else given.target
+        self._stated = load_rig(given.file) if given is not None and given.sensors else None
+        self._detector = None if self.target is None else detector_of(self.target)
+        self._kept: deque[Kept] = deque()
+        self._source: Growing | None = None
+        self._began = time.monotonic()
+
+    def look(self) -> bool:
+        """Reads a part of what is new; whether there was any."""
+        try:
+            self._source = self._source or open_growing_recording(self.root)
+            self.problem = "" if self._source else f"{self.root} is not there yet; waiting for it."
+            part = None if self._source is None else self._source.part()
+            if part is not None:
+                with tempfile.TemporaryDirectory(prefix="icalib-") as folder:
+                    self._take(part, part.recording(Path(folder)))
+        except (OSError, RecordingError) as error:
+            self.problem = str(error)
+            return False
+        return part is not None
+
+    def _take(self, part: NewPart, recording: Recording) -> None:
+        """Notes what a part holds, and keeps what a coarse problem needs."""
+        new = [t for t in recording.topics() if t.count]
+        for topic in new:
+            known = self.topics.setdefault(topic.name, Arrivals(replace(topic, count=0)))
+            known.topic = replace(known.topic, count=known.topic.count + topic.count)
+            known.arrived = time.monotonic()
+        self.sensors = self._topics_of_sensors()
+        names = {t.name: name for name, t in self.sensors.items()}
+        added: dict[str, float] = {}
+        corners: dict[str, list[tuple[int, ImageCorners]]] = {}
+        for topic in (t for t in new if t.kind):
+            with suppress(RecordingError):  # such as messages without an image
+                name = names.get(topic.name, topic.name)
+                if topic.kind == "image":
+                    added[name], corners[name] = self._search(recording, self.topics[topic.name])
+                elif len(stamps := recording.stamps(topic.name).tolist()):
+                    added[name] = self.topics[topic.name].note(stamps)
+        if min(added.values(), default=0.0) < -1e-9 * SET_BACK_NS:
+            self._kept.clear()
+        seconds = max(0.0, added.get(next(iter(self.sensors), ""), 0.0))
+        self._feel(recording)
+        clouds = {t.name for t in new if t.kind in ("points", "")}
+        self._keep(Kept(part.without(clouds), seconds, corners))
+
+    def _topics_of_sensors(self) -> dict[str, TopicInfo]:
+        """Topic by name of the sensor: of the rig file, or of all topics that may be sensors. The IMU comes first."""
+        topics = [arrivals.topic for arrivals in self.topics.values()]
+        if self._stated is None:
+            named = {name: source.topic for name, source in find_sources(topics).sensors.items()}
+        else:
+            pairs = ((name, self._topic_of(s, topics)) for name, s in self._stated.sensors.items())
+            named = {name: topic for name, topic in pairs if topic is not None}
+        return dict(sorted(named.items(), key=lambda item: item[1].kind != "imu"))
+
+    def _topic_of(self, sensor: Sensor, topics: list[TopicInfo]) -> TopicInfo | None:
+        """The topic of a sensor of the rig file; None while it has none."""
+        kinds = inspectors()[sensor.sensor_type].topic_kinds
+        stated = [x for x in (getattr(sensor, "topic", None), getattr(sensor, "path", None)) if isinstance(x, str)]
+        if named := [t for t in topics if t.kind in kinds and t.name.lstrip("/") in {x.lstrip("/") for x in stated}]:
+            return named[0]
+        with suppress(RecordingError):
+            return choose_topic(str(self.root), topics, sensor.name, None, *kinds)
+        return None
+
+    def _search(self, recording: Recording, camera: Arrivals) -> tuple[float, list[tuple[int, ImageCorners]]]:
+        """Notes the images of a camera. Returns the recorded time [s] that they add, and stamps and corners of those
+        that are searched: at SEARCH_HZ, or fewer while the search takes more than SEARCH_SHARE of the time."""
+        seconds, searched = 0.0, []
+        for payload in recording.payloads(camera.topic.name):
+            is_due = abs(payload.stamp_ns - camera.searched_ns) >= 1e9 / SEARCH_HZ
+            seconds += camera.note([payload.stamp_ns])
+            camera.size = (payload.width, payload.height) if payload.width else camera.size
+            if self._detector is None or not is_due or camera.searching > self._may_search():
+                continue
+            begin = time.process_time()
+            with suppress(DamagedImageError):
+                image = decode(payload)
+                camera.size = image.shape[1], image.shape[0]
+                corners = self._detector.detect(image)
+                searched.append((payload.stamp_ns, corners))
+                camera.searched_ns = payload.stamp_ns
+                self._note_corners(camera, corners)
+            camera.searching += min(time.process_time() - begin, SLOWEST_SEARCH_S)
+        return seconds, searched
+
+    def _may_search(self) -> float:
+        """Processor time [s] that the search may have taken so far, for each camera."""
+        cameras = sum(arrivals.topic.kind == "image" for arrivals in self.topics.values())
+        return SEARCH_SHARE * (time.monotonic() - self._began + 1.0) / cameras
+
+    def _note_corners(self, camera: Arrivals, corners: ImageCorners) -> None:
+        uv = corners.uv[corners.kept]
+        camera.searched += 1
+        camera.sees = len(uv) > 0
+        camera.seen += camera.sees
+        if camera.size is not None and camera.sees:
+            camera.cells += np.array(coverage(uv, camera.size))
+
+    def _feel(self, recording: Recording) -> None:
+        """Adds the readings of the IMU to the motion."""
+        name, topic = next(iter(self.sensors.items()), ("", None))
+        if topic is None or topic.kind != "imu":
+            return
+        unstated = ImuSensor(name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
+        sensor = self._stated.sensors[name] if self._stated else unstated
+        with suppress(RecordingError):
+            if isinstance(sensor, ImuSensor) and isinstance(imu := imu_readings(recording, sensor), ImuStream):
+                self.motion.add(in_si(imu, sensor), self.topics[topic.name].rate_hz)
+
+    def _keep(self, kept: Kept) -> None:
+        """Keeps a part, and lets the oldest go: all but WINDOW_S of recorded time."""
+        self.seconds += kept.seconds
+        self._kept.append(kept)
+        while sum(k.seconds for k in self._kept) - self._kept[0].seconds > WINDOW_S:
+            self._kept.popleft()
+
+    def rig(self) -> Rig | None:
+        """The rig of the sensors that have come so far: as stated, or else an IMU and cameras with a usual lens."""
+        if self._stated is not None:
+            return self._stated.only(*self.sensors) if self.sensors else None
+        sensors: dict[str, Any] = {}
+        for name, topic in self.sensors.items():
+            place = {"path" if topic.name.endswith(".csv") else "topic": topic.name}
+            if topic.kind == "imu" and not sensors:
+                sensors[name] = {"type": "imu", **place}
+            elif topic.kind == "image" and self.target is not None and (size := self.topics[topic.name].size):
+                sensors[name] = {"type": "camera", **place, "model": "pinhole-radtan", "resolution": [*size]}
+        if self.target is None or not any(s["type"] == "camera" for s in sensors.values()):
+            return None
+        key = "targets" if isinstance(self.target, Scene) else "target"
+        return rig_from_dict({"sensors": sensors, key: self.target.plain()}, str(self.root))
+
+    def coarse_problem(self) -> CoarseProblem | None:
+        """The problem of the last minutes; None while there is too little."""
+        if self.target is None or not self._kept or (rig := self.rig()) is None:
+            return None
+        corners, density = [], [1.0]
+        for camera in rig.cameras:
+            arrivals = self.topics[self.sensors[camera.name].name]
+            images = [pair for kept in self._kept for pair in kept.corners.get(camera.name, ())]
+            if arrivals.topic.kind != "image" or sum(bool(c.kept.any()) for _, c in images) < FEWEST_VIEWS:
+                rig = rig if arrivals.topic.kind != "image" else rig.without(camera.name)
+                continue
+            stamps, views = zip(*images, strict=True)
+            views, _ = without_rare_tags(self.target, number_continuously(self.target, views))
+            corners.append(corner_stream(camera.name, np.array(stamps), views))
+            density.append(arrivals.topic.count / max(arrivals.searched, 1))
+        rig = rig.without(*(s.name for s in rig.lidars))
+        if not corners and not any(self.sensors[c.name].kind == "corners" for c in rig.cameras):
+            return None
+        seconds = sum(k.seconds for k in self._kept)
+        parts, share = tuple(k.part for k in self._kept), seconds / max(self.seconds, 1e-9)
+        return CoarseProblem(rig, parts, tuple(corners), max(density), min(share, 1.0), self.seconds)
+
+
+# What is shown: tables, coverage of the images, and advice.
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table: title, headers, rows of text."""
+
+    title: str
+    headers: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class View:
+    """What is shown at an instant. coverage: title and map of each camera; advice: sentences, the first is the most
+    important."""
+
+    title: str
+    advice: tuple[str, ...]
+    tables: tuple[Grid, ...]
+    coverage: tuple[tuple[str, str], ...]
+
+    @property
+    def line(self) -> str:
+        """The state in one line."""
+        rows = self.tables[0].rows if self.tables else ()
+        sensors = ", ".join(f"{row[0]} {row[2]}" + (f" ({row[5]} with target)" if row[5] else "") for row in rows)
+        return f"{self.title}: {sensors or 'nothing has arrived'}. {self.advice[0] if self.advice else ''}".rstrip()
+
+
+def view(f: Follower, prediction: Expectation | None) -> View:
+    """What is known of a recording, and predicted."""
+    cameras = [(name, f.topics[t.name]) for name, t in f.sensors.items() if t.kind == "image"]
+    maps = tuple((name, coverage_map(a.cells.tolist())) for name, a in cameras if a.seen)
+    tables = [_arrived(f)]
+    if f.motion.count:
+        tables.append(_moved(f, prediction))
+    if prediction is not None and prediction.stds:
+        tables.append(_expected_table(prediction))
+    title = f"{f.root}, {f.seconds:.0f} s recorded"
+    return View(title, tuple(_advice(f, prediction)), tuple(tables), maps)
+
+
+def _arrived(f: Follower) -> Grid:
+    """One row for each sensor, then for other topics."""
+    names = {topic.name: name for name, topic in f.sensors.items()}
+    listed = sorted(f.topics.items(), key=lambda item: names.get(item[0], "~"))
+    rows = []
+    for topic, a in listed:
+        now = ("seen" if a.sees else "not seen") if a.searched else ""
+        share = f"{a.seen / a.searched:.0%}" if a.searched else ""
+        cells = f"{(a.cells > 0).sum()} of {a.cells.size}" if a.seen else ""
+        late = f"{time.monotonic() - a.arrived:.1f}"
+        rate = f"{a.rate_hz:.1f} Hz" if a.rate_hz else f"{a.topic.count} messages"
+        rows.append((names.get(topic, ""), topic, rate, late, now, share, cells))
+    headers = ("sensor", "topic", "rate", "last [s ago]", "target", "of images", "cells covered")
+    return Grid("What arrives", headers, tuple(rows))
+
+
+def _moved(f: Follower, prediction: Expectation | None) -> Grid:
+    """RMS angular rate about the axes of each sensor with a known rotation, and specific force in the imu frame."""
+    imu = next(iter(f.sensors))
+    frames = {imu: np.eye(3)} | dict({} if prediction is None else prediction.rotations)
+    rows = [(f"rotation about {name} [deg/s]", *_three(np.rad2deg(f.motion.rates(R)))) for name, R in frames.items()]
+    rows.append((f"acceleration along {imu} [m/s^2]", *_three(f.motion.shaking())))
+    return Grid("Motion so far (RMS)", ("", "x", "y", "z"), tuple(rows))
+
+
+def _three(values: np.ndarray) -> tuple[str, ...]:
+    return tuple(f"{v:.1f}" for v in values)
+
+
+def _expected_table(prediction: Expectation) -> Grid:
+    """Standard deviations of extrinsics, time offsets and lenses, one row for each group."""
+    rows = []
+    for (sensor, group), stds in _by_group(prediction).items():
+        unit, factor = display_unit(stds[0].unit)
+        needed = max(s.needed_s for s in stds)
+        state = "determined" if needed == 0.0 else f"{needed:.0f} s more" if np.isfinite(needed) else "move otherwise"
+        values = ", ".join(f"{factor * s.std:.3g}" if np.isfinite(s.std) else "unknown" for s in stds)
+        tolerance = f"{factor * stds[0].tolerance:.3g} {unit}"
+        name = group.replace("_", " ") + (f" {', '.join(s.label for s in stds)}" if len(stds) > 1 else "")
+        rows.append((sensor, f"{name} [{unit}]", values, tolerance, state))
+    title = f"Expected standard deviations, from the first {prediction.seconds:.0f} s"
+    return Grid(title, ("sensor", "parameter", "std", "tolerance", "until determined"), tuple(rows))
+
+
+def _by_group(prediction: Expectation) -> dict[tuple[str, str], list[ExpectedStd]]:
+    groups: dict[tuple[str, str], list[ExpectedStd]] = {}
+    for s in prediction.stds:
+        groups.setdefault((s.sensor, s.group), []).append(s)
+    return groups
+
+
+def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
+    """What is wrong, and what to do next."""
+    if f.problem:
+        yield f.problem
+    if f.target is None:
+        yield "Give the target, or the rig file, with --target FILE: then standard deviations are predicted."
+        return
+    cameras = {name: f.topics[t.name] for name, t in f.sensors.items() if t.kind == "image"}
+    if any(a.searched for a in cameras.values()) and not any(a.sees for a in cameras.values()):
+        yield f"The target is not in view of {' and '.join(cameras)}; bring it into view."
+    if prediction is None:
+        yield "Keep moving: there is too little yet for a prediction."
+    elif prediction.problem:
+        yield f"No prediction yet: {prediction.problem}"
+    else:
+        yield from _next_motion(f, prediction)
+    for name, a in cameras.items():
+        if a.seen and (empty := empty_borders(a.cells.tolist())):
+            yield f"Move the target into the {' and the '.join(empty)} of the image of {name}."
+
+
+def _next_motion(f: Follower, prediction: Expectation) -> Iterator[str]:
+    """The motion that the sensor farthest from its tolerances needs."""
+    yield from prediction.hidden
+    weak = [s for s in prediction.stds if s.needed_s > 0.0 and s.group in MOUNTED_NAMES]
+    if not weak:
+        yield f"All extrinsics and time offsets are determined after {prediction.seconds:.0f} s."
+        return
+    worst = max(weak, key=lambda s: s.std / s.tolerance)
+    more = f", {worst.needed_s:.0f} s more" if np.isfinite(worst.needed_s) else ""
+    if worst.group == TIME_OFFSET.name or not f.motion.count or worst.sensor not in prediction.rotations:
+        what = worst.group.replace("_", " ")
+        yield f"Turn and shake the rig faster, to and fro{more}, for the {what} of {worst.sensor}."
+        return
+    axis = "xyz"[int(np.argmin(f.motion.rates(prediction.rotations[worst.sensor])))]
+    yield f"Turn about the {axis} axis of {worst.sensor}{more}, for its {worst.group} {worst.label}."
+
+
+# The terminal, and a local page.
+
+REFRESH_S = 0.5
+LINE_EVERY_S = 5.0  # between lines where there is no terminal
+
+
+def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | None, out: Console | None = None) -> None:
+    """Shows the recording at `root` while it grows, until it is interrupted. address: of the page; None: no page.
+
+    Raises CalibrationError if the address cannot be used."""
+    console, follower, solver = out or Console(), Follower(root, given), Solver()
+    page = None if address is None else Page(address)
+    try:
+        if page is not None:
+            console.print(f"Page: http://{page.host}:{page.port}/", markup=False, highlight=False)
+        _show(follower, solver, page, console)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        solver.close()
+        if page is not None:
+            page.close()
+    console.print(view(follower, solver.latest).line, markup=False, highlight=False)
+
+
+def _show(follower: Follower, solver: Solver, page: Page | None, console: Console) -> None:
+    """Looks and shows, for ever. It rests for as long as it works, so that it takes half a core at most."""
+    drawn = printed = -inf
+    with Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else nullcontext() as live:
+        while True:
+            begin = time.monotonic()
+            follower.look()
+            solver.offer(follower.coarse_problem)
+            if begin - drawn >= REFRESH_S:
+                drawn, now = begin, view(follower, solver.latest)
+                if page is not None:
+                    page.show(now)
+                if live is not None:
+                    live.update(Group(*_lines(now)), refresh=True)
+                elif begin - printed >= LINE_EVERY_S:
+                    printed = begin
+                    console.print(now.line, markup=False, highlight=False)
+            time.sleep(max(LOOK_EVERY_S, time.monotonic() - begin))
+
+
+def _lines(now: View) -> Iterator[Any]:
+    """The view for a terminal."""
+    yield Text(now.title, style="bold")
+    yield from (Text(f"  {sentence}", style="yellow" if k == 0 else "") for k, sentence in enumerate(now.advice))
+    for grid in now.tables:
+        table = plain_table(grid.title, grid.headers, len(grid.headers), "")
+        for row in grid.rows:
+            table.add_row(*map(Text, row))
+        yield table
+    yield from (Text(f"{name}: corners over the image\n{cells}") for name, cells in now.coverage)
+
+
+class Page:
+    """A local page with the latest view, which refreshes itself. Raises CalibrationError if the address is taken."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._body = ""
+        page, frame = self, files("icalib.tools.inspection").joinpath("follow.html").read_text("utf-8")
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                content = {"/": frame, "/body": page._body}.get(self.path)
+                self.send_response(404 if content is None else 200)
+                self.send_header("Content-Type", "text/html; charset=utf-8")
+                self.end_headers()
+                self.wfile.write((content or "").encode())
+
+            def log_message(self, format: str, *args: Any) -> None:
+                """Nothing: the terminal shows the recording."""
+
+        try:
+            self._server = ThreadingHTTPServer(address, Handler)
+        except OSError as error:
+            raise CalibrationError(
+                f"--serve {address[0]}:{address[1]} cannot be used ({error.strerror or error}); give another port."
+            ) from error
+        self.host, self.port = str(self._server.server_address[0]), int(self._server.server_address[1])
+        Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def show(self, now: View) -> None:
+        """Replaces the content."""
+        advice = "".join(f"<li>{escape(sentence)}</li>" for sentence in now.advice)
+        tables = "".join(_html(grid) for grid in now.tables)
+        title = "{}: corners over the image"
+        maps = "".join(
+            f"<figure><figcaption>{escape(title.format(name))}</figcaption><pre>{cells}</pre></figure>"
+            for name, cells in now.coverage
+        )
+        self._body = f"<h1>{escape(now.title)}</h1><ol>{advice}</ol>{tables}<div class=maps>{maps}</div>"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def _html(grid: Grid) -> str:
+    head = "".join(f"<th>{escape(h)}</th>" for h in grid.headers)
+    rows = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in grid.rows)
+    return f"<section><h2>{escape(grid.title)}</h2><table><tr>{head}</tr>{rows}</table></section>"

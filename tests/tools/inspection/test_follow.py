@@ -1,0 +1,294 @@
+"""`icalib inspect --follow`: figures that are in time, predictions against the final result, and what survives."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.typed import not_none
+
+import icalib
+from icalib.cli.commands import main
+from icalib.data.folder import FilePart
+from icalib.data.measurements import CornerStream
+from icalib.pipeline import calibrate_measurements, measure
+from icalib.rig.file import load_rig
+from icalib.tools.inspection import read_target
+from icalib.tools.inspection.facts import GivenTarget
+from icalib.tools.inspection.follow import (
+    Arrivals,
+    CoarseProblem,
+    Expectation,
+    ExpectedStd,
+    Follower,
+    Page,
+    Solver,
+    predict,
+    view,
+)
+from icalib.tools.simulation import Imaging, film, handheld, write_film
+
+pytestmark = pytest.mark.slow
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "euroc"
+SECONDS = 6.0
+FACTOR = 1.5  # between a predicted and the final standard deviation of a determined parameter
+
+
+@pytest.fixture(scope="module")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bag of two small cameras and an IMU."""
+    pytest.importorskip("cv2")
+    base = handheld(SECONDS)
+    half = tuple(tuple(x / 2 for x in c.intrinsics) for c in base.cameras)
+    cameras = (replace(c, resolution=(376, 240), intrinsics=i) for c, i in zip(base.cameras, half, strict=True))
+    path = tmp_path_factory.mktemp("film") / "bag"
+    write_film(film(replace(base, cameras=tuple(cameras)), 4, Imaging(blur_px=0.6, noise=2.0)), {"mcap": path})
+    return next(path.glob("*.mcap"))
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("target") / "target.yaml"
+    path.write_text("{type: aprilgrid, rows: 6, cols: 6, tag_size: 0.088, tag_spacing: 0.3}")
+    return path
+
+
+def play(source: Path, to: Path, seconds: float) -> Iterator[float]:
+    """Writes a file in real time; yields the share that is written."""
+    whole, begin, at = source.read_bytes(), time.monotonic(), 0
+    with to.open("wb") as file:
+        while at < len(whole):
+            end = min(len(whole), int(len(whole) * (time.monotonic() - begin) / seconds))
+            file.write(whole[at:end])
+            file.flush()
+            at = end
+            yield at / len(whole)
+
+
+def test_a_bag_is_followed_in_time_with_half_a_core(filmed: Path, target: Path, tmp_path: Path):
+    given = read_target(target)
+    compiled = Follower(filmed, given)
+    assert compiled.look()
+    path, late = tmp_path / "live.mcap", [0.0]
+    follower = Follower(path, given)
+    assert not follower.look() and follower.problem == f"{path} is not there yet; waiting for it."
+    begin, processor = time.monotonic(), time.process_time()
+    for share in play(filmed, path, SECONDS):
+        worked = time.monotonic()
+        follower.look()
+        late.append(share * SECONDS - follower.seconds)
+        time.sleep(max(0.2, time.monotonic() - worked))
+    while follower.look():
+        pass
+    assert time.process_time() - processor < 0.5 * (time.monotonic() - begin)
+    assert max(late) < 2.0
+    arrived = {name: (round(a.rate_hz), a.topic.count) for name, a in follower.topics.items()}
+    count = round(20 * SECONDS) - 1
+    assert arrived == {
+        "/imu0": (200, round(200 * SECONDS) + 1),
+        "/cam0/image_raw": (20, count),
+        "/cam1/image_raw": (20, count),
+    }
+    assert list(follower.sensors) == ["imu0", "cam0", "cam1"]
+    camera = follower.topics["/cam0/image_raw"]
+    assert camera.sees and 0 < camera.seen <= 10 * SECONDS + 1 and camera.cells.sum() > 1000
+    assert follower.seconds == pytest.approx(SECONDS, abs=0.2)
+    np.testing.assert_array_less(20.0, np.rad2deg(follower.motion.rates(np.eye(3))))
+    np.testing.assert_array_less(1.0, follower.motion.shaking())
+
+
+def every(c: CornerStream, n: int) -> CornerStream:
+    kept = np.arange(len(c.stamps_ns)) % n == 0
+    return c.of_rows(kept[c.image], c.stamps_ns[kept], np.diff(c.start)[kept])
+
+
+def test_predictions_are_those_of_the_final_result():
+    """Of a real recording, from every second image, as of cameras of 20 Hz."""
+    rig = load_rig(EXAMPLE / "rig.yaml")
+    measured = measure(rig, EXAMPLE / "recording")[0]
+    final = calibrate_measurements(rig, measured)
+    imu = not_none(measured.imu)
+    columns = np.column_stack([imu.gyro, imu.accel]).tolist()
+    rows = "".join(f"{t},{','.join(map(repr, r))}\n" for t, r in zip(imu.stamps_ns.tolist(), columns, strict=True))
+    part = FilePart({"imu0/data.csv": (b"", rows.encode())}, {})
+    corners = tuple(every(c, 2) for c in measured.cameras)
+    coarse = predict(CoarseProblem(rig, (part,), corners, 2.0, 1.0, 36.0))
+    assert not coarse.problem and len(coarse.stds) == 14
+    for s in coarse.stds:
+        group = final.group(s.sensor, s.group)
+        k = group.labels.index(s.label)
+        assert group.verdict[k] == "determined" and s.needed_s == 0.0
+        assert 1.0 / FACTOR < s.std / group.std[k] < FACTOR
+    later = predict(CoarseProblem(rig, (part,), corners, 2.0, 0.25, 144.0))
+    assert later.stds[0].std == pytest.approx(0.5 * coarse.stds[0].std)
+    assert predict(CoarseProblem(rig, (part,), (every(corners[0], 40),), 2.0, 1.0, 36.0)).problem
+
+
+def follower_at(given: GivenTarget, **seen: tuple[int, int]) -> Follower:
+    """A follower without a recording, with cameras and a motion about x and y of the IMU. seen: (searched, seen)."""
+    f = Follower(Path("run.mcap"), given)
+    for name, topic in (("imu0", "imu"), *((name, "image") for name in seen)):
+        info = icalib.tools.inspection.follow.TopicInfo(f"/{name}", "", topic, 100, 0, 10)
+        f.topics[f"/{name}"] = Arrivals(info)
+        f.sensors[name] = info
+    for name, (searched, n) in seen.items():
+        a = f.topics[f"/{name}"]
+        a.searched, a.seen, a.sees = searched, n, n > 0
+        a.cells[:, 1:] = n
+    f.motion.seconds, f.motion.count, f.motion.turning = 10.0, 2000, np.diag([40.0, 50.0, 0.1])
+    return f
+
+
+def expected(group: str, label: str, std: float, needed_s: float) -> ExpectedStd:
+    return ExpectedStd("cam0", group, label, "rad" if group == "rotation" else "s", std, 0.001, needed_s)
+
+
+def test_advice_names_the_axis_and_the_place_in_the_image(target: Path):
+    given = read_target(target)
+    f = follower_at(given, cam0=(50, 50))
+    assert view(f, None).advice[0] == "Keep moving: there is too little yet for a prediction."
+    turned = {"cam0": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])}  # y of cam0 is z of imu0
+    weak = expected("rotation", "x", 0.002, 30.0)
+    now = view(f, Expectation(10.0, (weak,), turned))
+    assert now.advice == (
+        "Turn about the y axis of cam0, 30 s more, for its rotation x.",
+        "Move the target into the left edge of the image of cam0.",
+    )
+    assert now.line.startswith("run.mcap, 0 s recorded: cam0 100 messages (100% with target), imu0 100 messages. Turn")
+    late = expected("time_offset", "time_offset", 0.004, np.inf)
+    now = view(f, Expectation(10.0, (weak, late), turned, ("cam0: not determined by this motion; turn.",)))
+    assert now.advice[:2] == (
+        "cam0: not determined by this motion; turn.",
+        "Turn and shake the rig faster, to and fro, for the time offset of cam0.",
+    )
+    done = Expectation(12.0, (expected("rotation", "x", 0.0001, 0.0),), turned)
+    assert view(f, done).advice[0] == "All extrinsics and time offsets are determined after 12 s."
+    table = view(f, Expectation(10.0, (weak, late), turned)).tables[2]
+    assert table.rows == (
+        ("cam0", "rotation [deg]", "0.115", "0.0573 deg", "30 s more"),
+        ("cam0", "time offset [ms]", "4", "1 ms", "move otherwise"),
+    )
+    failed = Expectation(3.0, problem="too short.")
+    assert view(f, failed).advice[0] == "No prediction yet: too short."
+
+
+def test_a_target_out_of_view_is_said_first(target: Path):
+    f = follower_at(read_target(target), cam0=(50, 0))
+    assert view(f, None).advice[0] == "The target is not in view of cam0; bring it into view."
+    f = Follower(Path("run.mcap"))
+    assert view(f, None).advice == (
+        "Give the target, or the rig file, with --target FILE: then standard deviations are predicted.",
+    )
+
+
+def test_a_clock_that_is_set_back_leaves_out_what_was_before(tmp_path: Path):
+    arrivals = Arrivals(icalib.tools.inspection.follow.TopicInfo("/imu0", "", "imu", 0, None, None))
+    assert arrivals.note([10**9, 2 * 10**9]) == 1.0 and arrivals.rate_hz == 1.0
+    assert arrivals.note([10**18]) > 1e8 and arrivals.note([5]) < -1e8
+    (tmp_path / "imu0").mkdir()
+    table = tmp_path / "imu0" / "data.csv"
+    follower = Follower(tmp_path)
+    for first in (10**18, 10**12, 10**12 + 10**9):
+        with table.open("a") as file:
+            file.writelines(f"{first + k * 10**7},0.1,0.0,0.0,0.0,0.0,9.81\n" for k in range(100))
+        assert follower.look()
+    assert len(follower._kept) == 2 and follower.seconds == pytest.approx(0.99 + 1.0, abs=0.02)
+
+
+def test_memory_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("icalib.tools.inspection.follow.WINDOW_S", 5.0)
+    (tmp_path / "imu0").mkdir()
+    follower = Follower(tmp_path)
+    for second in range(20):
+        with (tmp_path / "imu0" / "data.csv").open("a") as file:
+            file.writelines(f"{second * 10**9 + k * 10**7},0.1,0.0,0.0,0.0,0.0,9.81\n" for k in range(100))
+        assert follower.look()
+    assert len(follower._kept) <= 7 and follower.seconds == pytest.approx(19.99)
+
+
+def test_a_solver_predicts_in_a_process_of_its_own(target: Path):
+    """A solve that fails is told, and another one follows only after a rest."""
+    rig = load_rig(EXAMPLE / "rig.yaml")
+    solver, asked = Solver(), []
+    problem = CoarseProblem(rig, (FilePart({}, {}),), (), 1.0, 1.0, 7.0)
+    try:
+        deadline = time.monotonic() + 120.0
+        while solver.latest is None and time.monotonic() < deadline:
+            solver.offer(lambda: asked.append(1) or problem)
+            time.sleep(0.1)
+        assert solver.latest is not None and solver.latest.seconds == 7.0 and solver.latest.problem
+        assert len(asked) == 1
+        solver._process.kill()  # as for lack of memory
+        solver._process.join()
+        solver._free_at, solver.latest = 0.0, None
+        while solver.latest is None and time.monotonic() < deadline:
+            solver.offer(lambda: problem)
+            time.sleep(0.1)
+        assert solver.latest is not None
+    finally:
+        solver.close()
+
+
+def test_the_page_shows_the_view(target: Path):
+    page = Page(("127.0.0.1", 0))
+    try:
+        page.show(view(follower_at(read_target(target), cam0=(50, 50)), None))
+        url = f"http://127.0.0.1:{page.port}/"
+        frame, body = (urllib.request.urlopen(url + name, timeout=10).read().decode() for name in ("", "body"))
+        assert 'fetch("body")' in frame and "<h1>run.mcap, 0 s recorded</h1>" in body and "<td>cam0</td>" in body
+        with pytest.raises(urllib.error.HTTPError):
+            urllib.request.urlopen(url + "other", timeout=10)
+        with pytest.raises(icalib.CalibrationError, match=r"--serve 127.0.0.1:\d+ cannot be used .* give another port"):
+            Page(("127.0.0.1", page.port))
+    finally:
+        page.close()
+
+
+def test_an_interrupt_ends_with_a_line(filmed: Path, target: Path, tmp_path: Path):
+    path = tmp_path / "live.mcap"
+    command = [sys.executable, "-c", "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)"]
+    command[-1] += "; from icalib.cli.commands import main; sys.exit(main())"
+    command += ["inspect", str(path), "--follow", "--target", str(target), "--serve", "0"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ)
+    time.sleep(5.0)
+    path.write_bytes(filmed.read_bytes()[:-50_000])  # a writer that is killed
+    time.sleep(10.0)
+    process.send_signal(signal.SIGINT)
+    out, error = process.communicate(timeout=60)
+    lines = " ".join(out.split())
+    assert process.returncode == 0 and error == ""
+    assert "Page: http://127.0.0.1:" in lines and "is not there yet; waiting for it." in lines
+    assert "recorded: cam0 20.0 Hz (100% with target), cam1 20.0 Hz (100% with target), imu0 200.0 Hz." in lines
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        (["--serve"], "--serve shows a recording that is being written; give --follow as well."),
+        (["--follow", "--json", "x"], "--follow takes --target and --serve only"),
+    ],
+)
+def test_options_that_do_not_go_together(options: list[str], sentence: str, capsys: pytest.CaptureFixture[str]):
+    assert main(["inspect", "run.mcap", *options]) == 1
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("text", "fine"), [("8800", True), ("0.0.0.0:80", True), ("x", False), ("a:99999", False)])
+def test_addresses(text: str, fine: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    if fine:
+        assert main(["inspect", "run.mcap", "--serve", text]) == 1  # without --follow
+        return
+    with pytest.raises(SystemExit):
+        main(["inspect", "run.mcap", "--follow", "--serve", text])
+    assert "must be PORT or HOST:PORT" in capsys.readouterr().err
