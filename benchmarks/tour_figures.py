@@ -1,4 +1,5 @@
-"""The figures of docs/tour.md: parts of the reports of its calibrations, as a browser draws them.
+"""The figures of docs/tour.md: parts of the reports of its calibrations, as a browser draws them. And docs/report.png,
+the first screen of the first of them, for the README.
 
 python benchmarks/tour_figures.py FOLDER      FOLDER is where the commands of the page were run
 """
@@ -16,7 +17,9 @@ import numpy as np
 from PIL import Image
 
 FIGURES = Path(__file__).resolve().parent.parent / "docs" / "tour"
+FIRST_SCREEN = FIGURES.parent / "report.png"
 WIDTH, TALLEST = 1100, 1600  # px
+SCREEN = 1280, 800  # px
 COLOURS = 256  # of the palette: keeps a figure below 150 kB
 FLAGS = (
     "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
@@ -53,6 +56,8 @@ def main() -> None:
     FIGURES.mkdir(exist_ok=True)
     for figure in FIGURES_OF_THE_PAGE:
         draw(chromium, folder / figure.result / "report.html", figure, FIGURES / f"{figure.name}.png")
+    text = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    _save(_shot(chromium, text, SCREEN), FIRST_SCREEN)
 
 
 def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
@@ -61,15 +66,24 @@ def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
     style = (
         f"<style>body {{ background: #fff; display: block; }} {hidden} {{ display: none !important; }}</style></head>"
     )
+    text = report.read_text(encoding="utf-8").replace("</head>", style, 1)
+    image = _shot(chromium, text, (WIDTH, TALLEST))
+    rows = np.flatnonzero((np.asarray(image) != 255).any(axis=(1, 2)))
+    _save(image.crop((0, max(int(rows[0]) - 8, 0), WIDTH, min(int(rows[-1]) + 9, TALLEST))), file)
+
+
+def _shot(chromium: str, text: str, size: tuple[int, int]) -> Image.Image:
+    """A page as a window of this size [px] shows it."""
     with tempfile.TemporaryDirectory() as scratch:
         page, shot = Path(scratch) / "page.html", Path(scratch) / "shot.png"
-        page.write_text(report.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
-        where = [f"--user-data-dir={scratch}/profile", f"--window-size={WIDTH},{TALLEST}", f"--screenshot={shot}"]
+        page.write_text(text, encoding="utf-8")
+        where = [f"--user-data-dir={scratch}/profile", f"--window-size={size[0]},{size[1]}", f"--screenshot={shot}"]
         command = [chromium, *FLAGS.split(), *where, page.as_uri()]
         subprocess.run(command, check=True, capture_output=True, timeout=300)
-        image = Image.open(shot).convert("RGB")
-    rows = np.flatnonzero((np.asarray(image) != 255).any(axis=(1, 2)))
-    image = image.crop((0, max(int(rows[0]) - 8, 0), WIDTH, min(int(rows[-1]) + 9, TALLEST)))
+        return Image.open(shot).convert("RGB")
+
+
+def _save(image: Image.Image, file: Path) -> None:
     image.quantize(COLOURS).save(file, optimize=True)
     print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
 

@@ -7,7 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from icalib.report.figures import CELL_PX, REJECTED, Figure, ResidualCurve, axis, dots, figure, line, numbers, thin
+from icalib.report.figures import (
+    CELL_PX,
+    REJECTED,
+    Figure,
+    ResidualCurve,
+    axis,
+    cut_marks,
+    dots,
+    figure,
+    line,
+    numbers,
+    shown_range,
+    thin,
+)
 from icalib.report.page import Group, Plot, Presenter, Section
 from icalib.report.rig_figures import PEN_UP
 from icalib.result import Calibration, ProjectionMap, projection_uncertainty, working_distance
@@ -18,6 +31,7 @@ from icalib.sensors.camera.stream import ImageResiduals, image_of
 
 MOST_DOTS = 2500  # dots of each kind in one figure; more are thinned out
 BINS = 60
+WIDEST_CELL = 98.0  # percentile of the cells of an image at which colours and arrows end
 FEWEST_IN_CELL = 5
 
 
@@ -59,23 +73,24 @@ def residuals_over_time(r: ImageResiduals) -> Figure:
     used, rejected = np.flatnonzero(r.used), np.flatnonzero(_measured(r))
     some, few = used[thin(len(used), MOST_DOTS)], rejected[thin(len(rejected), MOST_DOTS)]
     rms, keep = r.rms_of_images, thin(len(r.seconds), MOST_DOTS)
-    top = 1.5 * float(size[used].max(initial=1e-3))
-    seconds, clipped = r.seconds[image_of(r)], "rejected (clipped to the frame)"
+    top = shown_range(size[used])[1]
+    seconds, clipped, out = r.seconds[image_of(r)], "rejected (clipped to the frame)", used[size[used] > top]
     return figure(
         [
             dots(seconds[some], size[some], r.kind, "#93b7dc"),
+            *([cut_marks(seconds[out], size[out], 0.0, top)] if len(out) else []),
             *([dots(seconds[few], np.minimum(size[few], top), clipped, REJECTED, 4)] if len(few) else []),
             line(r.seconds[keep], rms[keep], "RMS of an image, per coordinate", "#0f2f57"),
         ],
         400,
         xaxis=axis("time [s]"),
-        yaxis=axis("residual [px]", rangemode="tozero"),
+        yaxis=axis("residual [px]", range=[0.0, 1.03 * top]),
     )
 
 
 def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figure:
-    """RMS residual in cells of the image [px], with the mean residual of each cell as a magnified arrow. resolution:
-    width and height [px]."""
+    """RMS residual in cells of the image [px], with the mean residual of each cell as a magnified arrow. Colours and
+    arrows are cut at a percentile of the cells. resolution: width and height [px]."""
     width, height = resolution
     nx, ny = max(1, round(width / CELL_PX)), max(1, round(height / CELL_PX))
     x, y = np.clip(r.uv[r.used], 0, [width - 1, height - 1]).T
@@ -94,6 +109,7 @@ def residuals_over_image(r: ImageResiduals, resolution: tuple[int, int]) -> Figu
         "colorscale": "YlGnBu",
         "reversescale": True,
         "zmin": 0,
+        "zmax": float(np.nanpercentile(rms, WIDEST_CELL)) if np.isfinite(rms).any() else 1.0,
         "colorbar": {"title": {"text": "RMS [px]"}, "thickness": 10},
         "hovertemplate": "RMS %{z} px<extra></extra>",
     }
@@ -115,14 +131,14 @@ def _measured(r: ImageResiduals) -> np.ndarray:
 
 
 def _arrows(at: np.ndarray, mean: np.ndarray) -> list[dict[str, Any]]:
-    """Traces of arrows at the points `at` (n, 2) along the mean residuals (n, 2) [px]. The longest is one cell long; a
-    dot marks the start of each."""
+    """Traces of arrows at the points `at` (n, 2) along the mean residuals (n, 2) [px]. At a percentile they are one
+    cell long, and longer ones are cut; a dot marks the start of each."""
     length = np.linalg.norm(mean, axis=1)
     longest = float(np.nanmax(length, initial=0.0))
     if longest == 0.0:
         return []
-    gain = CELL_PX / longest
-    tip = at + gain * mean
+    gain = CELL_PX / float(np.nanpercentile(length, WIDEST_CELL))
+    tip = at + np.minimum(gain, CELL_PX / np.maximum(length, 1e-12))[:, None] * mean
     pieces = np.stack([at, tip, np.full_like(at, np.nan)], axis=1).reshape(-1, 2)
     foot = at[np.isfinite(length)]
     name = f"mean, x{gain:.0f} (longest {longest:.3f} px)"
@@ -138,7 +154,7 @@ _IMAGE_WORDS = (
     "Predicted - measured, of corners of the target and of tracked points of the scene. A good calibration leaves a"
     " round cloud about zero, and arrows without a pattern. What was rejected stays in the data and is red. At most"
     f" {MOST_DOTS} dots of a kind are drawn, evenly picked; densities, cells, RMS and histograms use "
-    "all that is in use."
+    f"all that is in use. Colours and arrows of the image end at {WIDEST_CELL:g} % of its cells."
 )
 _LENS_WORDS = (
     "Standard deviation, in its worst direction, of where a camera projects points, from the covariance of its "
