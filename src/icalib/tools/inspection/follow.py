@@ -32,6 +32,7 @@ from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.data.messages import TopicInfo, choose_topic
 from icalib.data.recording import Growing, NewPart
 from icalib.data.recordings import DamagedImageError, Recording, decode, open_growing_recording, read_measurements
+from icalib.data.stamps import LONGEST_S
 from icalib.detection.decoding import ImageCorners, corner_stream
 from icalib.detection.detectors import detector_of
 from icalib.detection.images import number_continuously, without_rare_tags
@@ -61,7 +62,7 @@ SLOWEST_SEARCH_S = 0.5  # of an image, as far as SEARCH_SHARE counts it: the fir
 SOLVE_SHARE = 0.2  # of a core, at most, for solves
 RECENT = 100  # stamps from which a rate is computed
 FEWEST_VIEWS = 25  # images with the target before the first solve; a first guess needs 20 pairs
-SET_BACK_NS = 1_000_000_000  # a clock that goes back by more was set; what was before is then left out
+SET_BACK_NS = 1_000_000_000  # a clock that goes back by more was set, and what was before is left out
 
 # The coarse problem. It runs in a process of its own.
 
@@ -240,10 +241,11 @@ class Arrivals:
     size: tuple[int, int] | None = None
 
     def note(self, stamps_ns: Sequence[int]) -> float:
-        """Notes new stamps. Returns the recorded time [s] that they add, negative if the clock was set back."""
-        before = self.recent[-1] if self.recent else stamps_ns[0]
+        """Notes new stamps. Returns the recorded time [s] that they add; NaN if the clock was set."""
+        steps = np.diff([*list(self.recent)[-1:], *stamps_ns])
         self.recent.extend(stamps_ns)
-        return 1e-9 * (stamps_ns[-1] - before)
+        was_set = ((steps < -SET_BACK_NS) | (steps > 1e9 * LONGEST_S)).any()
+        return np.nan if was_set else float(1e-9 * steps.sum())
 
     @property
     def rate_hz(self) -> float:
@@ -344,9 +346,9 @@ class Follower:
                     added[name], corners[name] = self._search(recording, self.topics[topic.name])
                 elif len(stamps := recording.stamps(topic.name).tolist()):
                     added[name] = self.topics[topic.name].note(stamps)
-        if min(added.values(), default=0.0) < -1e-9 * SET_BACK_NS:
+        if np.isnan(list(added.values())).any():
             self._kept.clear()
-        seconds = max(0.0, added.get(next(iter(self.sensors), ""), 0.0))
+        seconds = max((s for s in added.values() if s > 0.0), default=0.0)
         self._feel(recording)
         clouds = {t.name for t in new if t.kind in ("points", "")}
         self._keep(Kept(part.without(clouds), seconds, corners))
@@ -487,8 +489,8 @@ class View:
     @property
     def line(self) -> str:
         """The state in one line."""
-        rows = self.tables[0].rows if self.tables else ()
-        sensors = ", ".join(f"{row[0]} {row[2]}" + (f" ({row[5]} with target)" if row[5] else "") for row in rows)
+        rows = self.tables[0].rows
+        sensors = ", ".join(f"{row[0]} {row[2]}" + f" ({row[5]} with target)" * bool(row[5]) for row in rows)
         return f"{self.title}: {sensors or 'nothing has arrived'}. {self.advice[0] if self.advice else ''}".rstrip()
 
 
@@ -501,22 +503,19 @@ def view(f: Follower, prediction: Expectation | None) -> View:
         tables.append(_moved(f, prediction))
     if prediction is not None and prediction.stds:
         tables.append(_expected_table(prediction))
-    title = f"{f.root}, {f.seconds:.0f} s recorded"
-    return View(title, tuple(_advice(f, prediction)), tuple(tables), maps)
+    return View(f"{f.root}, {f.seconds:.0f} s recorded", tuple(_advice(f, prediction)), tuple(tables), maps)
 
 
 def _arrived(f: Follower) -> Grid:
     """One row for each sensor, then for other topics."""
     names = {topic.name: name for name, topic in f.sensors.items()}
-    listed = sorted(f.topics.items(), key=lambda item: names.get(item[0], "~"))
     rows = []
-    for topic, a in listed:
+    for topic, a in sorted(f.topics.items(), key=lambda item: names.get(item[0], "~")):
         now = ("seen" if a.sees else "not seen") if a.searched else ""
         share = f"{a.seen / a.searched:.0%}" if a.searched else ""
         cells = f"{(a.cells > 0).sum()} of {a.cells.size}" if a.seen else ""
-        late = f"{time.monotonic() - a.arrived:.1f}"
         rate = f"{a.rate_hz:.1f} Hz" if a.rate_hz else f"{a.topic.count} messages"
-        rows.append((names.get(topic, ""), topic, rate, late, now, share, cells))
+        rows.append((names.get(topic, ""), topic, rate, f"{time.monotonic() - a.arrived:.1f}", now, share, cells))
     headers = ("sensor", "topic", "rate", "last [s ago]", "target", "of images", "cells covered")
     return Grid("What arrives", headers, tuple(rows))
 
@@ -525,13 +524,10 @@ def _moved(f: Follower, prediction: Expectation | None) -> Grid:
     """RMS angular rate about the axes of each sensor with a known rotation, and specific force in the imu frame."""
     imu = next(iter(f.sensors))
     frames = {imu: np.eye(3)} | dict({} if prediction is None else prediction.rotations)
-    rows = [(f"rotation about {name} [deg/s]", *_three(np.rad2deg(f.motion.rates(R)))) for name, R in frames.items()]
-    rows.append((f"acceleration along {imu} [m/s^2]", *_three(f.motion.shaking())))
-    return Grid("Motion so far (RMS)", ("", "x", "y", "z"), tuple(rows))
-
-
-def _three(values: np.ndarray) -> tuple[str, ...]:
-    return tuple(f"{v:.1f}" for v in values)
+    figures = {f"rotation about {name} [deg/s]": np.rad2deg(f.motion.rates(R)) for name, R in frames.items()}
+    figures[f"acceleration along {imu} [m/s^2]"] = f.motion.shaking()
+    rows = tuple((what, *(f"{v:.1f}" for v in values)) for what, values in figures.items())
+    return Grid("Motion so far (RMS)", ("", "x", "y", "z"), rows)
 
 
 def _expected_table(prediction: Expectation) -> Grid:
@@ -558,8 +554,11 @@ def _by_group(prediction: Expectation) -> dict[tuple[str, str], list[ExpectedStd
 
 def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     """What is wrong, and what to do next."""
+    late = time.monotonic() - max((a.arrived for a in f.topics.values()), default=inf)
     if f.problem:
         yield f.problem
+    elif late > SILENT_S:
+        yield f"Nothing has arrived for {late:.0f} s: the recorder has ended, or its disk is full."
     if f.target is None:
         yield "Give the target, or the rig file, with --target FILE: then standard deviations are predicted."
         return
@@ -597,6 +596,7 @@ def _next_motion(f: Follower, prediction: Expectation) -> Iterator[str]:
 # The terminal, and a local page.
 
 REFRESH_S = 0.5
+SILENT_S = 5.0  # recorders write a chunk more often
 LINE_EVERY_S = 5.0  # between lines where there is no terminal
 
 
