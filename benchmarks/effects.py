@@ -133,12 +133,14 @@ def camera_wheels() -> Scenario:
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of rig: its scenario, whether the IMU is in the rig, the effects on it, and how its lenses are treated."""
+    """A kind of rig: its scenario, whether the IMU is in the rig, the effects on it, how its lenses are treated, and
+    when effects begin [s]."""
 
     scenario: Callable[[], Scenario]
     imu: bool
     effects: tuple[str, ...]
     lens: Literal["free", "fixed"] = "free"
+    instant_s: float = 5.3
 
 
 KINDS = {
@@ -150,7 +152,7 @@ KINDS = {
     "positions + IMU": Kind(positions_imu, True, ()),
     "wheels + poses + IMU": Kind(wheels_poses_imu, True, (*IMU_EFFECTS, SCALE)),
     "wheels + poses": Kind(wheels_poses_imu, False, (SCALE,)),
-    "camera + wheels": Kind(camera_wheels, False, (SIZE,), "fixed"),
+    "camera + wheels": Kind(camera_wheels, False, (SIZE,), "fixed", 3.1),
 }
 
 
@@ -252,7 +254,7 @@ def row_of(kind: Kind, effect: str, times: float, seeds: Sequence[int]) -> Row:
 # The table: what an effect costs that is outside of the model, and whether it is named.
 
 LEVELS = (3.0, 10.0, 30.0)  # standard deviations by which an effect moves the result
-FIRST, SECOND = (0.55, 9.0), (0.45, 0.5)  # what lasts from an instant on, and for half a second [share, s]
+AT_INSTANT, FOR_A_WHILE = np.inf, 0.5  # s
 # Identifiers of sentences that name a cause; all others say that numbers are uncertain, or describe residuals.
 CAUSES = re.compile(
     r"clock_(drifts|rate_estimated|jumps)|imu_not_ideal|imu_noise_(under|over)stated|ranges_contradict|range_\w+_estimated"
@@ -266,7 +268,7 @@ CAUSES = re.compile(
 class Outside:
     """An effect outside of the model. unit: a small size, from which sizes are scaled; 0: it is there or not; most: the
     largest plausible one, both in units of `words`. changed: the scenario with an effect of a size; lasts: None: it is
-    there all the time, else from which share of the recording on, and for how long [s]. named: pattern of
+    there all the time, else how long from an instant on [s]. named: pattern of
     `identifier: sentence` that names it. power: of the size, with which the result moves. streams, rig: what else is
     changed."""
 
@@ -276,7 +278,7 @@ class Outside:
     words: str
     named: str
     changed: Callable[[Scenario, float], Scenario] = lambda scenario, _: scenario
-    lasts: tuple[float, float] | None = None
+    lasts: float | None = None
     power: int = 1
     streams: Callable[[Measurements], Measurements] = lambda measured: measured
     rig: Callable[[Rig], Rig] = lambda rig: rig
@@ -327,14 +329,14 @@ def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
             (lambda s, x: replace(s, T_world_board=_bumped(s.T_world_board, x))),
         )
         yield Outside("target size", 1e-3, 0.05, "", "target_size_wrong|lengths_contradict", size)
-        yield Outside("target moved", 1e-3, 0.3, "rad", "(target|board)\\w* mov|moves.*board", moved, FIRST)
+        yield Outside("target moved", 1e-3, 0.3, "rad", "(target|board)\\w* mov|moves.*board", moved, AT_INSTANT)
     for lidar in scenario.of(SimLidar):
         yield from _of_lidar(lidar)
     for poses in scenario.of(SimPoses):
-        yield Outside("scale of poses", 1e-3, 0.05, "", "scale|lengths_", _with(poses.name, scale=lambda s, x: s + x))
+        yield Outside("scale of poses", 1e-3, 0.01, "", "scale|lengths_", _with(poses.name, scale=lambda s, x: s + x))
     for wheels in scenario.of(SimWheels):
         turned = _with(wheels.name, radii=lambda r, x: (r[0] * (1.0 + x), r[1]))
-        yield Outside("left radius changes", 1e-3, 0.1, "", "wheel_sizes_change", turned, FIRST)
+        yield Outside("left radius changes", 1e-3, 0.1, "", "wheel_sizes_change", turned, AT_INSTANT)
         yield Outside("swapped wheels", 0.0, 1.0, "", "wheels?_(swapped|sizes_implausible)", streams=_swapped_wheels)
     if kind.imu:
         yield from _of_imu()
@@ -343,18 +345,22 @@ def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
 def _of_clock_and_mount(name: str) -> Iterator[Outside]:
     rate, step = _with(name, clock_rate_ppm=lambda _, x: x), _with(name, time_offset_s=lambda t, x: t - x)
     yield Outside(f"clock rate of {name}", 10.0, 500.0, "ppm", f"clock_(drifts|rate).*{name}", rate)
-    yield Outside(f"clock of {name} jumps", 2e-4, 0.1, "s", f"clock_jumps.*{name}", step, FIRST)
+    yield Outside(f"clock of {name} jumps", 2e-4, 0.1, "s", f"clock_jumps.*{name}", step, AT_INSTANT)
     bump = _with(name, T_imu_sensor=_bumped)
-    yield Outside(f"{name} bumped", 1e-3, 0.3, "rad", f"mount_moves.*{name}", bump, FIRST)
+    yield Outside(f"{name} bumped", 1e-3, 0.3, "rad", f"mount_moves.*{name}", bump, AT_INSTANT)
 
 
 def _of_camera(name: str) -> Iterator[Outside]:
     readout = _with(name, readout_s=lambda _, x: abs(x))
     yield Outside("rolling shutter", 5e-4, 0.03, "s", f"rolling_shutter.*{name}", readout)
     focal = _with(name, intrinsics=lambda k, x: (k[0] * (1.0 + x), k[1] * (1.0 + x), *k[2:]))
-    yield Outside("focal length changes", 1e-3, 0.05, "", f"lens_changes.*{name}|{name}.*lens_changes", focal, FIRST)
+    yield Outside(
+        "focal length changes", 1e-3, 0.05, "", f"lens_changes.*{name}|{name}.*lens_changes", focal, AT_INSTANT
+    )
     bad = _with(name, corner_noise_px=lambda s, x: s * (1.0 + abs(x)))
-    yield Outside("bad images for 0.5 s", 20.0, 100.0, "x noise", f"(disturbance|many_outliers).*{name}", bad, SECOND)
+    yield Outside(
+        "bad images for 0.5 s", 20.0, 100.0, "x noise", f"(disturbance|many_outliers).*{name}", bad, FOR_A_WHILE
+    )
 
 
 def _of_lidar(lidar: SimLidar) -> Iterator[Outside]:
@@ -398,23 +404,24 @@ def _swapped_wheels(measured: Measurements) -> Measurements:
     return measured.with_streams(*(replace(w, rate=w.rate[:, ::-1].copy()) for w in measured.of(WheelStream)))
 
 
-def recorded(base: Scenario, effect: Outside, size: float, seed: int) -> tuple[Measurements, list[Simulation]]:
+def recorded(kind: Kind, effect: Outside, size: float, seed: int) -> tuple[Measurements, list[Simulation]]:
     """Measurements with an effect, and the simulations whose truths they have: both sides of one that begins."""
+    base, begin = kind.scenario(), kind.instant_s
     after = simulate(effect.changed(base, size), seed)
     if effect.lasts is None:
         return effect.streams(after.measurements), [after]
-    before, begin = simulate(base, seed), effect.lasts[0] * base.duration_s
+    before, end = simulate(base, seed), begin + effect.lasts
     sides = [
         (before, -np.inf, begin),
-        (after, begin, begin + effect.lasts[1]),
-        (before, begin + effect.lasts[1], np.inf),
+        (after, begin, end),
+        (before, end, np.inf),
     ]
     streams = []
     for key, stream in before.measurements.streams.items():
         parts = [_part(simulation, key, low, high) for simulation, low, high in sides]
         joined = type(stream).joined([part for part in parts if len(part.stamps_ns)])
         streams.append(replace(joined, joins_ns=()))
-    return Measurements.of_streams(*streams), [before, after] if effect.lasts == FIRST else [before]
+    return Measurements.of_streams(*streams), [before, after] if effect.lasts == AT_INSTANT else [before]
 
 
 def _part(simulation: Simulation, key: str, low: float, high: float) -> Stream:
@@ -453,7 +460,7 @@ class Cell:
 
 def cell(kind: Kind, base: Scenario, effect: Outside, size: float, seed: int) -> Cell:
     """Calibrates a recording with an effect of this size."""
-    measured, sides = recorded(base, effect, size, seed)
+    measured, sides = recorded(kind, effect, size, seed)
     try:
         result = calibrate_measurements(effect.rig(rig_of(base, kind)), _of_kind(measured, kind))
     except CalibrationError as failure:
@@ -479,8 +486,8 @@ def shift(kind: Kind, base: Scenario, effect: Outside, plain: dict[str, Calibrat
     rig = rig.with_(settings=replace(rig.settings, segments=0))  # nothing is named and estimated
     own = effect.rig.__name__
     if own not in plain:
-        plain[own] = calibrate_measurements(rig, _of_kind(recorded(base, NOTHING, 0.0, 0)[0], kind))
-    result = calibrate_measurements(rig, _of_kind(recorded(base, effect, effect.unit, 0)[0], kind))
+        plain[own] = calibrate_measurements(rig, _of_kind(recorded(kind, NOTHING, 0.0, 0)[0], kind))
+    result = calibrate_measurements(rig, _of_kind(recorded(kind, effect, effect.unit, 0)[0], kind))
     moved = [0.0]
     for g in plain[own].groups:
         other = result.group_or_none(g.sensor, g.name)

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
+import pytest
+from scipy.linalg import block_diag
 from tests.cases import each
 
 from icalib.estimate.parameter_changes import Candidate, Change, Scatter, _Form
@@ -13,23 +18,30 @@ CANDIDATE = Candidate(("cam0",), "rotation", np.eye(B)[:, :3], np.ones(3))
 
 
 def form(J: np.ndarray, gradient: np.ndarray) -> tuple[_Form, np.ndarray]:
-    """Form of segments with Jacobians J (G, n, B), tolerances 1, and their information (G, B, B)."""
+    """Form of segments with Jacobians J (G, n, B) that no trajectory links, tolerances 1, and their information (G, B,
+    B)."""
     information = np.einsum("gni,gnj->gij", J, J)
-    values, vectors = np.linalg.eigh(information.sum(axis=0))
-    return _Form(information, gradient, vectors / np.sqrt(np.maximum(values, 1e-6))), information
+    rows = information[:, COLUMNS].reshape(-1, B)
+    whole = np.block([[information.sum(axis=0), rows.T], [rows, block_diag(*information[:, COLUMNS][:, :, COLUMNS])]])
+    pull = np.concatenate([gradient.sum(axis=0), gradient[:, COLUMNS].ravel()])
+    problem = SimpleNamespace(layout=SimpleNamespace(size=B), tolerance=np.ones(B), fixed_directions=np.zeros((0, 0)))
+    parts: Any = SimpleNamespace(varying=lambda _: (whole, pull), problem=problem, count=G)
+    return _Form.of(parts, COLUMNS).of_candidate(CANDIDATE), information
 
 
 def test_the_change_is_that_of_a_joint_solve():
     rng = np.random.default_rng(0)
     gradient = 10.0 * rng.standard_normal((G, B))
     tested, information = form(10.0 * rng.standard_normal((G, 30, B)), gradient)
-    change = tested.seen_by(CANDIDATE).change(PATTERN)
+    change = tested.change(PATTERN)
     cross = np.einsum("g,gij->ij", PATTERN, information)[:, COLUMNS]
     changed = np.einsum("g,gij->ij", PATTERN**2, information)[np.ix_(COLUMNS, COLUMNS)]
     inverse = np.linalg.inv(np.block([[information.sum(axis=0), cross], [cross.T, changed]]))
     pull = np.concatenate([gradient.sum(axis=0), (PATTERN[:, None] * gradient)[:, COLUMNS].sum(axis=0)])
     np.testing.assert_allclose(change.step, -(inverse @ pull)[B:], rtol=1e-6)
     np.testing.assert_allclose(change.std, np.sqrt(np.diag(inverse))[B:], rtol=1e-6)
+    gain = pull @ inverse @ pull - pull[:B] @ np.linalg.solve(information.sum(axis=0), pull[:B])
+    assert change.gain == pytest.approx(gain, rel=1e-6) and change.gain < tested.scatter().gain
 
 
 def test_a_direction_that_nothing_shows_does_not_change():
@@ -37,9 +49,9 @@ def test_a_direction_that_nothing_shows_does_not_change():
     rng = np.random.default_rng(1)
     J, gradient = 10.0 * rng.standard_normal((G, 30, B)), 10.0 * rng.standard_normal((G, B))
     J[:, :, 2] = 0.0
-    tested, information = form(J, gradient)
-    information[:, 2, 2] = -1e-4
-    change = tested.seen_by(CANDIDATE).change(PATTERN)
+    tested, _ = form(J, gradient)
+    tested.information[:, 2, :, 2] -= 1e-4
+    change = tested.change(PATTERN)
     assert np.isfinite(change.std).all() and np.abs(change.step).max() < 0.1 and change.gain >= 0.0
     assert np.abs(change.step[2]) < 1e-3 * change.std[2]
 
@@ -50,7 +62,7 @@ def test_a_direction_that_the_data_hardly_determine_does_not_change():
     J, gradient = 10.0 * rng.standard_normal((G, 30, B)), 10.0 * rng.standard_normal((G, B))
     J[:, :, 1] *= 1e-4
     tested, _ = form(J, gradient)
-    change = tested.seen_by(CANDIDATE).change(PATTERN)
+    change = tested.change(PATTERN)
     assert change.dof == 2 and abs(change.step[1]) < 1e-2 and change.std[1] > 9.9
 
 

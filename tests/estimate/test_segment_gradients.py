@@ -72,6 +72,28 @@ def test_gradients_are_those_of_dense_matrices(on_target, dense):
     )
 
 
+@pytest.mark.parametrize("case", ["on_target", "on_tracks"])
+def test_parts_of_parameters_in_all_segments_are_the_parameters(case: str, request: pytest.FixtureRequest):
+    """Their columns add up to those of the parameters, and gradients too, the trajectory eliminated."""
+    problem, outcome = request.getfixturevalue(case)
+    parts = parts_of(replace(problem, priors=()), outcome)
+    columns, B, G = parts.problem.layout.columns("cam0", "rotation"), parts.problem.layout.size, parts.count
+    information, gradient = parts.varying(columns)
+    close = {"rtol": 1e-6, "atol": 1e-6 * np.abs(parts.information).max()}
+    np.testing.assert_allclose(information[:B, :B], parts.information, **close)
+    added = information[B:].reshape(G, 3, -1).sum(axis=0)
+    np.testing.assert_allclose(added[:, :B], parts.information[columns], **close)
+    np.testing.assert_allclose(
+        added[:, B:].reshape(3, G, 3).sum(axis=1), parts.information[columns][:, columns], **close
+    )
+    of_all = parts.gradients.sum(axis=0)
+    np.testing.assert_allclose(gradient[:B], of_all, rtol=1e-6, atol=1e-6 * np.abs(gradient).max())
+    np.testing.assert_allclose(
+        gradient[B:].reshape(G, 3).sum(axis=0), of_all[columns], atol=1e-6 * np.abs(gradient).max()
+    )
+    assert np.abs(information[B : B + 3, B + 3 : B + 6]).max() > 1e-4 * np.abs(information[B : B + 3, B : B + 3]).max()
+
+
 def test_gradients_and_that_of_the_priors_cancel_at_the_optimum(on_target):
     problem, outcome = on_target
     (prior,) = problem.priors

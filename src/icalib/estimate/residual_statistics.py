@@ -24,6 +24,7 @@ from icalib.optim.arrowhead import (
     in_parallel,
     marginalise,
     restricted_inverse,
+    sums_of_priors,
     variance_of_priors,
 )
 from icalib.optim.state import State
@@ -86,28 +87,29 @@ LOOSE_FRAME_INFORMATION = 1e-3
 
 class PieceGradient(NamedTuple):
     """Gradient of half the chi^2 of a segment. chain (n, D): of its keyframes from `first` on; calib (B,): of the
-    calibration parameters."""
+    calibration parameters. Or m columns of its information: chain (n, D, m), calib (B, m)."""
 
     first: int
     chain: np.ndarray
     calib: np.ndarray
 
     @classmethod
-    def of(cls, piece: Piece) -> PieceGradient:
-        """The gradient in the sums of `piece`, before it is eliminated."""
-        return cls(piece.first, piece.side[:, :, -1].copy(), piece.calib[:-1, -1].copy())
+    def of(cls, piece: Piece, columns: int | np.ndarray = -1) -> PieceGradient:
+        """The gradient in the sums of `piece`, before it is eliminated, or its `columns`."""
+        return cls(piece.first, piece.side[:, :, columns].copy(), piece.calib[:-1, columns].copy())
 
-    def add(self, piece: Piece, column: int) -> None:
-        """Adds the gradient to `column` of `piece`. A keyframe that two pieces share counts in the earlier one, the
-        calibration parameters in the piece of the segment's first keyframe."""
+    def add(self, piece: Piece, columns: int | slice) -> bool:
+        """Adds the gradient to `columns` of `piece`. A keyframe that two pieces share counts in the earlier one, the
+        calibration parameters in the piece of the segment's first keyframe. Returns whether it is this."""
         first = piece.first + (piece.first > 0)
         start, end = max(first, self.first), min(piece.last + 1, self.first + len(self.chain))
         if start < end:
-            piece.side[start - piece.first : end - piece.first, :, column] += self.chain[
+            piece.side[start - piece.first : end - piece.first, :, columns] += self.chain[
                 start - self.first : end - self.first
             ]
-        if first <= self.first <= piece.last:
-            piece.calib[: len(self.calib), column] += self.calib
+        if is_first := first <= self.first <= piece.last:
+            piece.calib[: len(self.calib), columns] += self.calib
+        return is_first
 
 
 @dataclass(frozen=True)
@@ -131,13 +133,9 @@ class Segments:
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Segments | None:
         """About `count` segments of similar length, at least one per recording. None if they would be too short, or if
         one cannot be solved alone."""
-        count, fewest = _as_many_as_stand_alone(problem, count)
-        if count < 2:
+        if (parts := cls.cut(problem, outcome.state, count)) is None:
             return None
-        ends = segment_ends(problem.chain.starts, problem.n_keyframes, count)
-        if len(ends) < 3 or np.diff(ends).min() < fewest:
-            return None
-        parts = cls(problem.cut(outcome.state, ends[:-1]), outcome.state, ends, *[np.zeros(0)] * 3)
+        ends = parts.ends
         scratch = parts.problem.reusable_output(outcome.residuals)
         try:
             gradients, sums = zip(*in_parallel(lambda g: parts.alone(g, scratch), range(len(ends) - 1)), strict=True)
@@ -146,6 +144,17 @@ class Segments:
             return None
         B = problem.layout.size
         return replace(parts, sums=np.array(sums), gradients=joint[:B, B:-1].T, information=joint[:B, :B])
+
+    @classmethod
+    def cut(cls, problem: Problem, state: State, count: int) -> Segments | None:
+        """As `of`, without sums."""
+        count, fewest = _as_many_as_stand_alone(problem, count)
+        if count < 2:
+            return None
+        ends = segment_ends(problem.chain.starts, problem.n_keyframes, count)
+        if len(ends) < 3 or np.diff(ends).min() < fewest:
+            return None
+        return cls(problem.cut(state, ends[:-1]), state, ends, *[np.zeros(0)] * 3)
 
     @property
     def count(self) -> int:
@@ -183,6 +192,38 @@ class Segments:
             return piece
 
         return self.problem.marginal(piece_between)
+
+    def varying(self, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Information (n, n) and gradient (n,) of the B calibration parameters and, in each segment, of a further part
+        of m of them, those with `columns`; n = B + G m. The joint trajectory is eliminated, priors are included."""
+        problem, state, B, m = self.problem, self.state, self.problem.layout.size, len(columns)
+        scratch, n = problem.residuals(), B + self.count * m
+
+        def columns_of(g: int) -> tuple[PieceGradient, PieceGradient]:
+            piece = self.piece(g, scratch)
+            return PieceGradient.of(piece, columns), PieceGradient.of(piece)
+
+        of_segments = in_parallel(columns_of, range(self.count))
+
+        def piece_between(first: int, last: int) -> Piece:
+            piece = problem.piece_with_columns(state, first, last, n + 1 - B, scratch)
+            for at, (repeated, gradient) in zip(range(B, n, m), of_segments, strict=True):
+                own = slice(at, at + m)
+                if repeated.add(piece, own):
+                    piece.calib[own, own] += repeated.calib[columns]
+                    piece.calib[own, n] += gradient.calib[columns]
+                gradient.add(piece, n)
+            if piece.features is not None:
+                piece.features.repeat(columns, self.ends - piece.first, B)
+            return piece
+
+        whole = problem.marginal(piece_between)[:-1, :-1]
+        whole = np.triu(whole) + np.triu(whole, 1).T
+        information, gradient = whole[:-1, :-1], whole[:-1, -1]
+        _, pull, known = sums_of_priors(problem.priors, state, B)
+        information[:B, :B] += known
+        gradient[:B] += pull
+        return information, gradient
 
     @property
     def known(self) -> np.ndarray:

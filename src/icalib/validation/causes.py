@@ -11,8 +11,8 @@ from icalib.base.remark import Remark
 from icalib.data.measurements import ImuStream
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
-from icalib.estimate.parameter_changes import Change, Scatter, changes, scatter
-from icalib.estimate.residual_statistics import Segments, rows_of
+from icalib.estimate.parameter_changes import NO_CHANGES, Change, Changes, changes
+from icalib.estimate.residual_statistics import rows_of
 from icalib.kinds import assessors
 from icalib.motion.factor import FitKey
 from icalib.motion.poses import PPM
@@ -55,8 +55,7 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     misfit = Misfit.of(fits)
     known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
     if not against and (drifts or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
-        scattering = assessed.factor > LARGE_FACTOR
-        known = [*stated, *varying_causes(assessed, misfit, scattering)]
+        known = [*stated, *varying_causes(assessed, misfit)]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
@@ -120,10 +119,6 @@ def _moves_others(assessed: AssessedEstimate, relaxed_rig: Relaxed, key: Key) ->
 # Share of the misfit that a cause must gain to explain it. Robust weights hide part of the gain; wrong causes gain less
 # than 0.01.
 MIN_EXPLAINED_SHARE = 0.1
-# Share that one change must gain of the gain by separate parameters for each segment. A simulated change gains 0.36 to
-# 0.99, less if it is far from a segment boundary. On EuRoC, where lens and board do not follow the model, the best
-# change gains 0.04.
-MIN_CHANGE_SHARE = 0.25
 ALIKE = 0.8  # share of the best gain from which on another change explains the data as well
 LARGE = 2.0  # tolerances; a constant value is wrong by half of a change
 INERTIAL = ("gyroscope", "accelerometer")
@@ -175,24 +170,22 @@ def any_explains(causes: Iterable[Cause], misfit: Misfit) -> bool:
 # Causes that vary over the recording.
 
 
-def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool) -> Iterator[Cause]:
+def varying_causes(assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause]:
     """Causes that vary over the recording: sensors that do not measure together, a disturbance at one time, or a
-    parameter that changes. scattering: whether estimates from segments scatter more than predicted."""
+    parameter that changes."""
     for assessment in assessments(assessed):
         yield from assessment.clock_causes
-    causes, segments, timeline = list[Cause](), assessed.segments, assessed.timeline
-    is_amiss = bool(misfit.fits) or scattering
-    by_gain, clear = (), None
-    if segments is not None and (is_amiss or any(e.is_suspected for e in assessed.effects)):
-        by_gain = changes(segments, assessed.inputs.sensors)
-        clear = _clear_change(by_gain, scatter(segments))
-    if effects := list(effect_causes(assessed, by_gain, clear)):  # the others may follow from these
+    causes, timeline = list[Cause](), assessed.timeline
+    estimate, tried = assessed.estimate, NO_CHANGES
+    if assessed.segments is not None:
+        tried = changes(estimate.problem, estimate.outcome.state, assessed.inputs.sensors)
+    if effects := list(effect_causes(assessed, tried)):  # the others may follow from these
         yield from effects
         return
     if misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
         causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
-    if segments is not None and clear is not None and is_amiss:
-        causes += _change(by_gain, segments, misfit, timeline)
+    if tried.clear is not None:
+        causes += _change(tried, estimate, misfit, timeline)
     # the best one only: a change also enlarges residuals at one time, like a disturbance
     yield from ranked(causes)[:1]
 
@@ -200,11 +193,12 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit, scattering: bool)
 LIKELY = 10.0  # times its usual size: a larger effect, of 500 ppm, is named only, as something else may look like it
 
 
-def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: Change | None) -> Iterator[Cause]:
+def effect_causes(assessed: AssessedEstimate, tried: Changes) -> Iterator[Cause]:
     """A cause for each effect that differs from zero, with standard deviations that include the scatter of segments; or
-    that is the `clear` change, as one step leaves scatter where it is large. by_gain: all changes; a clock that jumps
-    does not drift."""
-    jumping = {c.sensors for c in by_gain if c.name == TIME_OFFSET.name and not c.is_clock_drift}
+    that is the clear change of those `tried`, as one step leaves scatter where it is large. A clock that jumps does not
+    drift."""
+    clear = tried.clear
+    jumping = {c.sensors for c in tried.by_gain if c.name == TIME_OFFSET.name and not c.is_clock_drift}
     drifting = clear.sensors if clear is not None and clear.is_clock_drift else ()
     rig = assessed.inputs.user_rig or assessed.inputs.rig
     duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
@@ -223,40 +217,33 @@ def effect_causes(assessed: AssessedEstimate, by_gain: Sequence[Change], clear: 
             yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=remedy)
 
 
-def _clear_change(by_gain: Sequence[Change], spread: Scatter) -> Change | None:
-    """The first of the changes, if it explains clearly more than all others."""
-    if not by_gain or by_gain[0].gain < MIN_CHANGE_SHARE * spread.beyond_chance or not spread.exceeded_by(by_gain[0]):
-        return None
-    return by_gain[0]
-
-
-def _change(by_gain: Sequence[Change], segments: Segments, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
+def _change(tried: Changes, estimate: Estimate, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
     """The clear change. Two that explain as much are named together if they are the same change, seen from either
     sensor, or changes of one sensor. A clock that drifts is an effect, and none of these."""
-    best = by_gain[0]
-    alike = [c for c in by_gain if c.gain > ALIKE * best.gain]
+    best = tried.by_gain[0]
+    alike = [c for c in tried.by_gain if c.gain > ALIKE * best.gain]
     kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
     if best.pattern != "pulse" and not best.is_clock_drift and all((c.name, c.pattern) in kinds_of_best for c in alike):
-        words = _change_words(alike, segments, timeline)
-        share = min(best.gain / scatter(segments).beyond_chance, 1.0)
+        words = _change_words(alike, estimate, timeline)
+        share = min(best.gain / tried.scatter.beyond_chance, 1.0)
         words = words.with_sentence(f"{words} This explains {share:.0%} of what varies over the recording.")
-        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, segments))
+        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, estimate))
 
 
-def _is_large(c: Change, segments: Segments) -> bool:
+def _is_large(c: Change, estimate: Estimate) -> bool:
     """Whether a parameter changes by more than LARGE tolerances."""
-    tolerance = segments.problem.tolerance[segments.problem.layout.columns(c.sensors[0], c.name)]
+    tolerance = estimate.problem.tolerance[estimate.problem.layout.columns(c.sensors[0], c.name)]
     return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
 
 
-def _change_words(alike: list[Change], segments: Segments, timeline: Timeline) -> Remark:
+def _change_words(alike: list[Change], estimate: Estimate, timeline: Timeline) -> Remark:
     """A sentence on a change. alike: changes that explain about as much, the best first."""
     best = alike[0]
     others = list(dict.fromkeys(" and ".join(c.sensors) for c in alike if c.sensors != best.sensors))
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.name == TIME_OFFSET.name:
         return _clock_words(best, others, when, timeline)
-    changed = [_changed(c, segments) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
+    changed = [_changed(c, estimate) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
     what = " or ".join(size for size, _ in changed)
     advice = " ".join(dict.fromkeys(against for _, against in changed))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
@@ -270,17 +257,17 @@ def _names(c: Change) -> str:
     return " and ".join(c.sensors)
 
 
-def _changed(c: Change, segments: Segments) -> tuple[Remark, str]:
+def _changed(c: Change, estimate: Estimate) -> tuple[Remark, str]:
     """Texts with the size of a change of a lens, of wheels or of extrinsics, and what to do against it."""
     if c.name == "intrinsics":
         size = Remark("lens_changes", f"its lens by up to {np.abs(c.value).max():.2g} px")
         return size, "Switch off autofocus, zoom and image stabilisation."
     if c.name not in ("rotation", "translation"):
-        value = segments.state.values[c.sensors[0], c.name]
+        value = estimate.outcome.state.values[c.sensors[0], c.name]
         sentence = f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
         size = Remark("wheel_sizes_change", sentence)
         return size, "Check tyres, load and encoders."
-    turn, move = _sizes(segments, c)
+    turn, move = _sizes(estimate, c)
     return Remark(
         "mount_moves", f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
     ), "Fasten all mounts."
@@ -310,9 +297,9 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
-def _sizes(segments: Segments, c: Change) -> tuple[float, float]:
+def _sizes(estimate: Estimate, c: Change) -> tuple[float, float]:
     """Angle [rad] and distance [m] of a change of rotation, translation or both."""
-    layout, n = segments.problem.layout, 0
+    layout, n = estimate.problem.layout, 0
     sizes = {"rotation": 0.0, "translation": 0.0}
     for name in sizes:
         if layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
