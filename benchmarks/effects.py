@@ -318,7 +318,11 @@ def _rings(lidar: SimLidar, size_deg: float) -> tuple[float, ...]:
 def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
     """All effects on a rig; of several sensors of one kind the first has them."""
     for sensor in (*scenario.cameras[:1], *scenario.sensors):
-        yield from _of_clock_and_mount(sensor.name)
+        seen = sensor.name if kind.imu else ""  # else it may be any: motion is relative to one of them
+        yield from _of_clock(sensor.name, seen)
+        if not isinstance(sensor, SimWheels):  # a robot moves as its wheels do, wherever these are
+            bump = _with(sensor.name, T_imu_sensor=_bumped)
+            yield Outside(f"{sensor.name} bumped", 1e-3, 0.3, "rad", f"mount_moves.*{seen}", bump, AT_INSTANT)
     for camera in scenario.cameras[:1]:
         yield from _of_camera(camera.name)
     if len(scenario.cameras) > 1:
@@ -337,17 +341,15 @@ def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
     for wheels in scenario.of(SimWheels):
         turned = _with(wheels.name, radii=lambda r, x: (r[0] * (1.0 + x), r[1]))
         yield Outside("left radius changes", 1e-3, 0.1, "", "wheel_sizes_change", turned, AT_INSTANT)
-        yield Outside("swapped wheels", 0.0, 1.0, "", "wheels?_(swapped|sizes_implausible)", streams=_swapped_wheels)
+        yield Outside("swapped wheels", 0.0, 1.0, "", "wheels are swapped|sizes_implausible", streams=_swapped_wheels)
     if kind.imu:
         yield from _of_imu()
 
 
-def _of_clock_and_mount(name: str) -> Iterator[Outside]:
-    rate, step = _with(name, clock_rate_ppm=lambda _, x: x), _with(name, time_offset_s=lambda t, x: t - x)
-    yield Outside(f"clock rate of {name}", 10.0, 500.0, "ppm", f"clock_(drifts|rate).*{name}", rate)
-    yield Outside(f"clock of {name} jumps", 2e-4, 0.1, "s", f"clock_jumps.*{name}", step, AT_INSTANT)
-    bump = _with(name, T_imu_sensor=_bumped)
-    yield Outside(f"{name} bumped", 1e-3, 0.3, "rad", f"mount_moves.*{name}", bump, AT_INSTANT)
+def _of_clock(name: str, seen: str) -> Iterator[Outside]:
+    rate, step = _with(name, clock_rate_ppm=lambda _, x: x), _with(name, time_offset_s=lambda t, x: t - abs(x))
+    yield Outside(f"clock rate of {name}", 10.0, 500.0, "ppm", f"clock_(drifts|rate).*{seen}", rate)
+    yield Outside(f"clock of {name} jumps", 2e-4, 0.1, "s", f"clock_jumps.*{seen}", step, AT_INSTANT)
 
 
 def _of_camera(name: str) -> Iterator[Outside]:

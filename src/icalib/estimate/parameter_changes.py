@@ -2,13 +2,13 @@
 refocused.
 
 Score test of parameter constancy (Nyblom 1989; for a break, Chow 1960). The estimate has constant calibration
-parameters. In the test those of one group are x + d_g e in segment g. The pattern d_g is linear in time (drift), or
-0 before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and of e, from
+parameters. In the test those of one group are x + d_g e in segment g. The pattern d_g is linear in time (drift), or 0
+before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and of e, from
 which the trajectory of the whole recording is eliminated: that it goes on shows a jump. One solve gives e, its
-covariance, and the decrease of chi^2. A pulse, a single segment that differs, is no change, but competes with them: one bad set of images looks like
-a small step. Only directions that the data determine change. Gains are compared with the scatter of the segments
-that is left, as formal standard deviations are too small where the model is wrong. Changes within a segment are not
-detected."""
+covariance, and the decrease of chi^2. A pulse, a single segment that differs, is no change, but competes with them:
+one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
+the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
+Changes within a segment are not detected."""
 
 from __future__ import annotations
 

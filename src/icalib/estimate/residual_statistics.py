@@ -208,10 +208,10 @@ class Segments:
         def piece_between(first: int, last: int) -> Piece:
             piece = problem.piece_with_columns(state, first, last, n + 1 - B, scratch)
             for at, (repeated, gradient) in zip(range(B, n, m), of_segments, strict=True):
-                own = slice(at, at + m)
-                if repeated.add(piece, own):
-                    piece.calib[own, own] += repeated.calib[columns]
-                    piece.calib[own, n] += gradient.calib[columns]
+                part = slice(at, at + m)
+                if repeated.add(piece, part):
+                    piece.calib[part, part] += repeated.calib[columns]
+                    piece.calib[part, n] += gradient.calib[columns]
                 gradient.add(piece, n)
             if piece.features is not None:
                 piece.features.repeat(columns, self.ends - piece.first, B)

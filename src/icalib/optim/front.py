@@ -47,8 +47,8 @@ class PieceFeatures:
         segment = np.zeros(len(sums.side), dtype=np.int64)
         segment[sums.track] = np.searchsorted(ends[1:-1], sums.keyframe[sums.image], side="right")
         for g in range(len(ends) - 1):
-            own = segment == g
-            sums.side[own, :, first + m * g : first + m * (g + 1)] = sums.side[own][:, :, columns]
+            features = segment == g
+            sums.side[features, :, first + m * g : first + m * (g + 1)] = sums.side[features][:, :, columns]
 
 
 @dataclass(frozen=True)
