@@ -5,7 +5,7 @@ Score test of parameter constancy (Nyblom 1989; for a break, Chow 1960). The est
 parameters. In the test those of one group are x + d_g e in segment g. The pattern d_g is linear in time (drift), or 0
 before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and of e, from
 which the trajectory of the whole recording is eliminated: that it goes on shows a jump. One solve gives e, its
-covariance, and the decrease of chi^2. A pulse, a single segment that differs, is no change, but competes with them:
+covariance, and the decrease of chi^2. A pulse, two segments that differ, is no change, but competes with them:
 one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
 the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
 Changes within a segment are not detected."""
@@ -32,8 +32,8 @@ from icalib.sensors.sensor import TIME_OFFSET
 # information in tolerance units (sigma of 1000 tolerances): keeps the form positive definite if unobservable
 RIDGE_INFORMATION = 1e-6
 Pattern = Literal["drift", "step", "pulse"]
-ROUNDING_OF_GAIN = 1.001  # of the gain of separate parameters, which bounds that of a change
 SIGNIFICANT = 25.0  # gain of one parameter, five standard deviations, as many instants are tried; of more: as unlikely
+LEAD = 9.0  # of gains of two patterns: three standard deviations
 INSTANTS = 16  # segments, at whose ends changes are tried
 # Share that a change must gain of the gain by separate parameters for each segment. On EuRoC, where lens and board do
 # not follow the model, the best change gains 0.04.
@@ -75,8 +75,8 @@ class Change:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What separate parameters for each segment gain. gain: decrease of chi^2; dof: number of their directions that
-    the segment shows."""
+    """What separate parameters for each pair of segments gain. gain: decrease of chi^2; dof: number of their
+    directions that are determined."""
 
     gain: float
     dof: float
@@ -87,17 +87,16 @@ class Scatter:
         return max(self.gain - self.dof, 1.0)
 
     def exceeded_by(self, change: Change) -> bool:
-        """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves. One
-        that gains more than separate parameters is none: it moves what no segment shows, as a frame that drifts."""
+        """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves."""
         rest = max((self.gain - change.gain) / max(self.dof - change.count, 1.0), 1.0)
         least = float(special.chdtri(max(change.count, 1), special.chdtrc(1, SIGNIFICANT)))
-        leads = change.gain > least * rest and change.gain - change.rival > SIGNIFICANT * rest
-        return change.count > 0 and leads and change.gain <= ROUNDING_OF_GAIN * self.gain
+        leads = change.gain > least * rest and change.gain - change.rival > LEAD * rest
+        return change.count > 0 and leads
 
 
 class Changes(NamedTuple):
     """by_gain: the pattern with the largest gain for each candidate, sorted by decreasing gain; scatter: what separate
-    parameters for each segment gain."""
+    parameters for each pair of segments gain."""
 
     by_gain: tuple[Change, ...]
     scatter: Scatter
@@ -165,8 +164,8 @@ def _patterns(ends: np.ndarray) -> Iterator[tuple[Pattern, float, np.ndarray]]:
     yield "drift", float(centre), (middle - centre) / (ends[-1] - ends[0])
     for second in ends[1:-1]:
         yield "step", float(second), (middle > second).astype(np.float64)
-    for second in middle:
-        yield "pulse", float(second), (middle == second).astype(np.float64)
+    for k in range(len(middle) - 1):
+        yield "pulse", float(ends[k + 1]), np.isin(np.arange(len(middle)), (k, k + 1)).astype(np.float64)
 
 
 class _Solved(NamedTuple):
@@ -223,7 +222,9 @@ class _Form:
         return _Solved.of(information, pattern @ self.gradient)
 
     def scatter(self) -> Scatter:
-        """What separate parameters for each segment gain."""
-        n = self.gradient.size
-        each = _Solved.of(self.information.reshape(n, n), self.gradient.ravel())
+        """What separate parameters for each pair of segments gain."""
+        pairs = np.arange(0, len(self.gradient), 2)
+        information = np.add.reduceat(np.add.reduceat(self.information, pairs, axis=0), pairs, axis=2)
+        gradient = np.add.reduceat(self.gradient, pairs, axis=0)
+        each = _Solved.of(information.reshape(gradient.size, -1), gradient.ravel())
         return Scatter(each.gain, each.dof)
