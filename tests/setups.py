@@ -52,6 +52,8 @@ TOLERANCE = {
     "readout": 1e-3,
     "intrinsics": 1.0,
     "size_effect": 1e-3,
+    "accel_delay": 1e-3,
+    "low_pass": 1e-5,
     "distortion": 1e-2,
     "tilt": 2e-3,
     "sheet_middle": 1e-2,
@@ -283,8 +285,7 @@ def make_features_on_planes(setup: Setup, *arguments, **options) -> tuple[Setup,
 
 
 def make_problem(setup: Setup, start: State | None = None, scheme: Scheme = "inertial") -> Problem:
-    columns = setup.layout.columns("imu0", "intrinsics")
-    imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, columns[columns >= 0])
+    imu = ImuFactor.build(setup.imu, start or setup.state, 9.81, setup.layout)
     cameras = tuple(make_factor(setup, i, scheme) for i in range(len(setup.sim.measurements.cameras)))
     return Problem(setup.layout, keyed((imu, *cameras)), (), setup.columns_scale())
 
@@ -328,8 +329,7 @@ class RoomSetup:
 
     def problem(self, start: State, noise: LidarNoise | None = None, **options) -> Problem:
         """IMU and LiDAR, the first keyframe held where it is."""
-        columns = self.layout.columns("imu0", "intrinsics")
-        imu = ImuFactor.build(self.imu, start, 9.81, columns[columns >= 0])
+        imu = ImuFactor.build(self.imu, start, 9.81, self.layout)
         lidar = self.factor(start, noise, **options)
         sensors = ImuSensor("imu0", "", class_noise("consumer")), Lidar(self.stream.name, "")
         tolerance = tolerance_of(self.layout, specs_of(self.layout, sensors), Settings())

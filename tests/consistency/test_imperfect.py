@@ -71,6 +71,30 @@ def test_an_imu_that_is_wrongly_called_ideal_is_named(program: ModuleType, kind:
     assert not [r for r in reasons if r.name == "residuals_unexplained" or (not largest and r.name == "imu_not_ideal")]
 
 
+@pytest.mark.parametrize("delay_s", [0.0, pytest.param(-0.02, marks=pytest.mark.full), 0.006])
+def test_an_accelerometer_that_is_late_is_found(program: ModuleType, delay_s: float):
+    scenario = replace(program.camera_imu(), imu_accel_delay_s=delay_s)
+    simulation = simulate(scenario, 1)
+    result = calibrate_measurements(program.rig_of(scenario, program.KINDS["camera + IMU"]), simulation.measurements)
+    said = [note.name for note in result.notes if note.name == "accel_delay_estimated"]
+    assert result.verdict == "usable" and len(said) == (delay_s != 0.0)
+    if said:
+        group = result.group("imu0", "accel_delay")
+        assert abs(group.value[0] - delay_s) < 4.0 * group.std[0] < 4e-4
+    assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
+
+
+@pytest.mark.parametrize("cutoff_hz", [8.0, pytest.param(50.0, marks=pytest.mark.full)])
+def test_a_filter_in_the_imu_is_named_where_it_smooths_the_motion(program: ModuleType, cutoff_hz: float):
+    scenario = replace(program.camera_imu(), imu_cutoff_hz=cutoff_hz)
+    measured = simulate(scenario, 1).measurements
+    result = calibrate_measurements(program.rig_of(scenario, program.KINDS["camera + IMU"]), measured)
+    assert [r.name for r in result.reasons[:1]] == (["imu_filtered"] if cutoff_hz < 10.0 else [])
+    if cutoff_hz < 10.0:
+        said = float(result.reasons[0].split("as if of ")[1].split()[0])
+        assert said == pytest.approx(cutoff_hz, rel=0.2)
+
+
 def poses_and_lidar(program: ModuleType, scale: float) -> Scenario:
     """Of `scale`, the ratio of true to reported ranges."""
     scenario = program.lidar_poses_imu()
@@ -168,7 +192,8 @@ def test_what_the_recording_does_not_show_of_an_imu_is_as_the_prior_says():
     sigma = class_imperfections("tactical").sigma
     measured = simulate(scenario, 2).measurements
     ideal = calibrate_measurements(rig_for(scenario), measured)
-    found = calibrate_measurements(rig_for(scenario, imu_intrinsics=Parameter("prior", np.zeros(24), sigma)), measured)
+    rig = rig_for(scenario, imu_intrinsics=Parameter("prior", np.zeros(24), sigma))
+    found = calibrate_measurements(rig.with_("imu0", low_pass=Parameter("fixed", np.zeros(1))), measured)
     group = found.group("imu0", "intrinsics")
     unknown = group.std > 0.98 * sigma
     assert unknown.sum() >= 9  # g-sensitivity at least

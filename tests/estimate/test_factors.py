@@ -35,14 +35,14 @@ from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import MIDDLE, EstimatedMotion, offset_at, poses_at, seconds_at
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece, Prior, accumulate_bias_prior, make_pieces
 from icalib.optim.rows import MIN_CURVATURE_RATIO
-from icalib.optim.state import State, in_recording, make_layout
+from icalib.optim.state import Entry, State, in_recording, make_layout
 from icalib.rig import Ground, Lidar, Loss, Scheme
 from icalib.rig.scene import SHEET_MIDDLE, TILT
 from icalib.sensors.camera.corner_factor import DELAY, SHIFT, CornerNoise
 from icalib.sensors.camera.spec import Shutter
 from icalib.sensors.camera.track_surfaces import ON_PLANES
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
-from icalib.sensors.imu.residual import ImuFactor, free_columns
+from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.board_factor import ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints
 from icalib.sensors.lidar.patch_factor import PatchFactor, PatchPoints, PatchRows
@@ -91,11 +91,19 @@ def with_gravity(setup):
     return replace(setup, layout=layout, state=replace(setup.state, values=values))
 
 
-def with_size_effect(setup):
-    """The setup with the places of the accelerometer's axes estimated."""
+EFFECTS = {
+    ("imu0", "size_effect"): np.arange(6) * 1e-3,
+    ("imu0", "accel_delay"): np.array([1e-3]),
+    ("imu0", "low_pass"): np.array([1e-6]),
+}
+
+
+def with_effects(setup):
+    """The setup with effects on the readings estimated."""
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
-    layout = make_layout([*entries, ("imu0", "size_effect", "nuisance", 6, True)])
-    values = setup.state.values | {("imu0", "size_effect"): np.arange(6) * 1e-3}
+    more: list[Entry] = [(*key, "nuisance", len(value), True) for key, value in EFFECTS.items()]
+    layout = make_layout([*entries, *more])
+    values = setup.state.values | EFFECTS
     return replace(setup, layout=layout, state=replace(setup.state, values=values))
 
 
@@ -103,10 +111,8 @@ def imu_sample(unlike, setup_of, imu_free, unit=False, places=False):
     """Preintegrated at another state, so that the corrections by bias and intrinsics are not zero."""
     setup = setup_of(unlike, imu_free=imu_free, size=unit)
     setup = in_unit(setup) if unit else with_gravity(setup)
-    setup = with_size_effect(setup) if places else setup
-    columns = np.concatenate([free_columns(setup.layout, "imu0"), setup.imu.unit_columns(setup.layout)])
-    last = setup.layout.columns("world", "gravity") if not unit else columns[:0]
-    factor = ImuFactor.build(setup.imu, setup.state, 0.0 if unit else 9.81, columns, last)
+    setup = with_effects(setup) if places else setup
+    factor = ImuFactor.build(setup.imu, setup.state, 0.0 if unit else 9.81, setup.layout)
     state = setup.perturbed(np.random.default_rng(0), 0.1)
 
     def residual(at):

@@ -38,8 +38,7 @@ def on_target(setup_of, problem_of) -> tuple[Problem, Outcome]:
 def on_tracks(setup_of, features_of) -> tuple[Problem, Outcome]:
     """The same corners as points of unknown position, with noise."""
     setup = setup_of(simulate(handheld(1.5), seed=6))
-    columns = setup.layout.columns("imu0", "intrinsics")
-    imu = ImuFactor.build(setup.imu, setup.state, 9.81, columns[columns >= 0])
+    imu = ImuFactor.build(setup.imu, setup.state, 9.81, setup.layout)
     factors = keyed((imu, features_of(setup, noise_px=0.3)))
     problem = Problem(setup.layout, factors, (), setup.columns_scale(), framed=False)
     return problem, minimise(problem, setup.state)

@@ -15,7 +15,7 @@ from icalib.estimate.inputs import UNGUESSED_TRANSLATION_SIGMA_M, Inputs, origin
 from icalib.model.bodies import SHAPE_SIGMA_M, SIZE
 from icalib.model.sensor_model import Pass, by_kind, model_of
 from icalib.motion.factor import Factor, FactorKey, IndependentKeyframes, Residuals, Whitened, keyed
-from icalib.motion.imu_data import ImuData, without_size_effect
+from icalib.motion.imu_data import ImuData, without_effects
 from icalib.motion.poses import (
     MIDDLE,
     RECORDING_MARGIN_S,
@@ -393,7 +393,7 @@ def assemble(
 def motion_of(inputs: Inputs, state: State) -> EstimatedMotion:
     """Motion of the IMU between the keyframes of `state`."""
     assert inputs.imu is not None
-    imu = without_size_effect(inputs.imu, state, state.bias[:, :3].mean(axis=0))
+    imu = without_effects(inputs.imu, state, state.bias[:, :3].mean(axis=0))
     return EstimatedMotion(state, imu, gravity_of(state, inputs.rig.gravity), inputs.rig.settings.max_gap_s)
 
 

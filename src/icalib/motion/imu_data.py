@@ -16,6 +16,8 @@ from icalib.geometry.small import mul3, polynomial_means, tmul3
 from icalib.geometry.targets.base import BOARD
 from icalib.optim.state import Key, Layout, State
 from icalib.rig import ImuNoise, ImuSensor, Rig, scene
+from icalib.sensors.imu.spec import ACCEL_DELAY, EFFECTS, SIZE_EFFECT
+from icalib.sensors.parameter import ParameterSpec
 from icalib.sensors.sensor import Sampling
 
 SAME_INSTANT_S = 1e-6  # s: on a common grid of stamps, rounding must not decide which of two instants is nearer
@@ -297,31 +299,52 @@ def correction_matrices(intrinsics):
     return F, G, -mul3(GA, F), GA
 
 
-# Size effect: each axis of an accelerometer is at a place of its own. The IMU frame has its origin at the x axis; the
-# y and z axes are at r_y and r_z [m], so that axis i reads e_i^T (f + dw/dt x r_i + w x (w x r_i)), all in the axes of
-# the gyroscope: misalignments of the axes change this by their size, which is neglected.
+# Effects on the readings, which are linear in their parameters. All are in the axes of the gyroscope; misalignments of
+# the axes change them by their size, which is neglected.
+#
+# size_effect: each axis of an accelerometer is at a place of its own. The IMU frame has its origin at the x axis; the y
+# and z axes are at r_y and r_z [m], so that axis i reads e_i^T (f + dw/dt x r_i + w x (w x r_i)).
+# accel_delay [s]: the accelerometer measures this long before the stamps, f(t - d).
+# low_pass [s^2]: of both sensors. A filter of Gaussian response sigma reads x + sigma^2 / 2 x'' to second order; a lag
+# belongs to the clock.
 
-N_SIZE_EFFECT = 6  # r_y, then r_z
 
-
-def size_effect_matrix(imu: ImuData, gyro_bias: np.ndarray) -> np.ndarray:
-    """(N, 3, 6) [1/s^2]: derivative of the accelerometer's readings by r_y and r_z. gyro_bias (3,) rad/s."""
-    w, J = np.ascontiguousarray(imu.gyro - gyro_bias), np.zeros((len(imu.gyro), 3, N_SIZE_EFFECT))
-    slope = np.gradient(w, imu.seconds, axis=0)
-    for begin, end in (*imu.gaps, *imu.seams):  # differences across a gap say nothing
-        slope[(imu.seconds >= begin) & (imu.seconds <= end)] = 0.0
-    W = so3.hat_many(w)
-    lever = so3.hat_many(np.ascontiguousarray(slope)) + W @ W
-    J[:, 1, :3], J[:, 2, 3:] = lever[:, 1], lever[:, 2]
+def reading_effect(imu: ImuData, effect: ParameterSpec, gyro_bias: np.ndarray) -> np.ndarray:
+    """(N, 6, m): derivative of the readings, gyroscope and accelerometer, by the m parameters of one of EFFECTS, zero
+    across gaps. gyro_bias (3,) rad/s."""
+    J = np.zeros((len(imu.gyro), 6, effect.size))
+    if effect is SIZE_EFFECT:
+        w = np.ascontiguousarray(imu.gyro - gyro_bias)
+        W = so3.hat_many(w)
+        lever = so3.hat_many(np.ascontiguousarray(_slope(imu, w))) + W @ W
+        J[:, 4, :3], J[:, 5, 3:] = lever[:, 1], lever[:, 2]
+    elif effect is ACCEL_DELAY:
+        J[:, 3:, 0] = -_slope(imu, imu.accel)
+    else:
+        J[:, :, 0] = _slope(imu, _slope(imu, np.hstack([imu.gyro, imu.accel])))
     return J
 
 
-def without_size_effect(imu: ImuData, state: State, gyro_bias: np.ndarray) -> ImuData:
-    """The readings that the accelerometer would have with all axes at the origin, by the size effect in `state`."""
-    places = state.values.get((imu.name, "size_effect"))
-    if places is None:
-        return imu
-    return replace(imu, accel=imu.accel - size_effect_matrix(imu, gyro_bias) @ places)
+def _slope(imu: ImuData, x: np.ndarray) -> np.ndarray:
+    """(N, m) difference quotients of x (N, m) by time; zero across gaps, where they say nothing."""
+    slope = np.gradient(x, imu.seconds, axis=0)
+    for begin, end in (*imu.gaps, *imu.seams):
+        slope[(imu.seconds >= begin) & (imu.seconds <= end)] = 0.0
+    return slope
+
+
+def without_effects(imu: ImuData, state: State, gyro_bias: np.ndarray) -> ImuData:
+    """The readings without the effects in `state`: those of sensors that measure at one place and at their stamps."""
+    for effect in EFFECTS:
+        if (value := state.values.get((imu.name, effect.name))) is None:
+            continue
+        if effect is ACCEL_DELAY:  # differences would amplify noise
+            later = imu.seconds + value[0]
+            imu = replace(imu, accel=np.stack([np.interp(later, imu.seconds, x) for x in imu.accel.T], axis=1))
+        else:
+            off = reading_effect(imu, effect, gyro_bias) @ value
+            imu = replace(imu, gyro=imu.gyro - off[:, :3], accel=imu.accel - off[:, 3:])
+    return imu
 
 
 # Sentences for messages: axes about which a body rotated, and about which it hardly did.

@@ -64,7 +64,7 @@ def solved(r, state, found):
         LidarFactor.build(s, plane, found.association.keys, motion, NOISE, layout)
         for s, plane in zip(r.streams, found.association.plane, strict=True)
     )
-    imu = ImuFactor.build(r.imu, state, 9.81, np.zeros(0, dtype=np.int64))
+    imu = ImuFactor.build(r.imu, state, 9.81, layout)
     sensors = ImuSensor("imu0", "", class_noise("consumer")), *(Lidar(s.name, "") for s in r.streams)
     tolerance = tolerance_of(layout, specs_of(layout, sensors), Settings())
     outcome = minimise(Problem(layout, keyed((imu, *lidars)), (), tolerance, framed=False), state)

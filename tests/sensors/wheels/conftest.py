@@ -305,7 +305,7 @@ def waves() -> type[Waves]:
 @pytest.fixture(scope="session")
 def problem_of() -> Callable[..., DriveProblem]:
     def make(world, wheels, rotation, position, sigma, start, priors=()):
-        imu = ImuFactor.build(world.imu, start, 9.81, np.zeros(0, dtype=np.int64))
+        imu = ImuFactor.build(world.imu, start, 9.81, world.layout)
         return DriveProblem(world.layout, imu, PoseFactor(rotation, position, sigma), wheels, priors)
 
     return make

@@ -12,12 +12,13 @@ from icalib.data.stamps import usual_step
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.motion.imu_data import further_imu_data
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause, Remedy
+from icalib.observability.prior_sensitivity import Effect
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline
 from icalib.rig import ImuSensor
 from icalib.sensors.imu.mounted_factor import SPEED_SIGMA_M_S
-from icalib.sensors.imu.spec import INTRINSICS, INTRINSICS_LABELS, SIZE_EFFECT, prior_words
+from icalib.sensors.imu.spec import ACCEL_DELAY, EFFECTS, INTRINSICS, INTRINSICS_LABELS, SIZE_EFFECT, prior_words
 from icalib.sensors.imu.stream import ImuResiduals
 
 
@@ -93,19 +94,14 @@ def _intrinsics_words(imu: ImuSensor) -> Remark | None:
 
 
 def causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each IMU whose accelerometer has axes at different places; else for each whose intrinsics are fixed
-    at those of an ideal one, and are others."""
-    places = {e.sensor: e for e in a.effects if e.spec is SIZE_EFFECT and e.differs}
-    for e in places.values():
-        # No second estimate with it: translations would refer to another point, the x axis, without being asked.
-        apart = 1e3 * float(np.linalg.norm(e.value.reshape(2, 3), axis=1).max())
-        sentence = (
-            f"the axes of the accelerometer of {e.sensor} are not at one place, but up to {apart:.2g} mm apart. Write "
-            "size_effect: free; translations then refer to its x axis."
-        )
-        yield Cause(Remark("imu_size_effect", sentence), e.gain)
-    for e in a.effects:
-        if e.spec is INTRINSICS and e.differs and e.sensor not in places:
+    """A cause for each effect on the readings of an IMU; without one, for each IMU whose intrinsics are fixed at those
+    of an ideal one, and are others."""
+    effects = [e for e in a.effects if e.differs]
+    affected = {e.sensor for e in effects if e.spec in EFFECTS}
+    for e in effects:
+        if e.spec in EFFECTS:
+            yield from _effect_causes(e)
+        elif e.spec is INTRINSICS and e.sensor not in affected:
             k = int(np.argmax(np.abs(e.value / e.std)))
             sentence = (
                 f"the rig file calls {e.sensor} ideal (intrinsics: fixed), and it is not: {INTRINSICS_LABELS[k]} is "
@@ -113,6 +109,31 @@ def causes(a: AssessedEstimate) -> Iterator[Cause]:
                 f"{e.sensor} in the rig file, so that they are estimated."
             )
             yield Cause(Remark("imu_not_ideal", sentence), e.gain, e.moves > 1.0)
+
+
+def _effect_causes(e: Effect) -> Iterator[Cause]:
+    """The cause of one of EFFECTS. A sharper response than an ideal one is none."""
+    value = float(e.value[0])
+    if e.spec is SIZE_EFFECT:
+        # No second estimate with it: translations would refer to another point, the x axis, without being asked.
+        apart = 1e3 * float(np.linalg.norm(e.value.reshape(2, 3), axis=1).max())
+        sentence = (
+            f"the axes of the accelerometer of {e.sensor} are not at one place, but up to {apart:.2g} mm apart. Write "
+            "size_effect: free; translations then refer to its x axis."
+        )
+        yield Cause(Remark("imu_size_effect", sentence), e.gain)
+    elif e.spec is ACCEL_DELAY:
+        how = f"{1e3 * abs(value):.2g} +- {1e3 * e.std[0]:.1g} ms {'before' if value > 0.0 else 'after'} its gyroscope"
+        sentence = f"the accelerometer of {e.sensor} measures {how}, at the same stamps. Write accel_delay: free."
+        note = f"the accelerometer of {e.sensor} measures {how}, which was estimated, too; write accel_delay: free."
+        remedy = Remedy(e.amended, Remark("accel_delay_estimated", note))
+        yield Cause(Remark("accelerometer_late", sentence), e.gain, e.moves > 1.0, remedy=remedy)
+    elif value > 0.0:
+        sentence = (
+            f"{e.sensor} has a low-pass filter, as if of {np.sqrt(0.5 * np.log(2.0) / value) / (2.0 * np.pi):.2g} Hz "
+            "(-3 dB). Set a higher bandwidth, and record again."
+        )
+        yield Cause(Remark("imu_filtered", sentence), e.gain, e.moves > 1.0)
 
 
 def misfit(imu: ImuSensor, f: SensorFit, is_noise: bool) -> Remark | None:

@@ -13,9 +13,8 @@ from icalib.motion.factor import Factor
 from icalib.motion.imu_data import further_imu_data
 from icalib.optim.state import Key
 from icalib.rig import ImuNoise, ImuSensor, Rig
-from icalib.rig.scene import GRAVITY, WORLD
 from icalib.sensors.imu.mounted_factor import MountedImuFactor, SlowMotion
-from icalib.sensors.imu.residual import ImuFactor, free_columns
+from icalib.sensors.imu.residual import ImuFactor
 
 
 class ImuModel(SensorModel[ImuSensor, ImuNoise]):
@@ -39,10 +38,7 @@ class ImuModel(SensorModel[ImuSensor, ImuNoise]):
         if sensor.mounted:
             yield MountedImuFactor.build(further_imu_data(sensor, at.parts, at.measurements), at.motion, at.layout)
             return
-        free, key = free_columns(at.layout, sensor.name), (WORLD, GRAVITY.name)
-        gravity = at.layout.columns(*key) if at.layout.has(*key) else free[:0]
-        columns = np.concatenate([free, at.motion.imu.unit_columns(at.layout)])
-        yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, columns, gravity)
+        yield ImuFactor.build(at.motion.imu, at.state, at.motion.gravity, at.layout)
 
     def joint_factors(
         self, sensors: Sequence[ImuSensor], factors: Sequence[Factor], noise: Mapping[str, ImuNoise], at: Pass

@@ -18,7 +18,7 @@ import numpy as np
 from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
-from icalib.motion.imu_data import ImuData, clear_of, without_size_effect
+from icalib.motion.imu_data import ImuData, clear_of, without_effects
 from icalib.motion.poses import EstimatedMotion, gravity_of, seconds_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, add_pose_chain
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece
@@ -35,6 +35,7 @@ from icalib.sensors.imu.residual import (
     fill_last_column,
     fill_residual,
     free_columns,
+    free_groups,
     free_values,
     preintegrated_with_jacobians,
     state_change,
@@ -68,7 +69,7 @@ def _linearise(first, last, chain, increments, dx, n_gravity, r, J):
 class MountedImuFactor(RowFactor):
     """All intervals of one mounted IMU between neighbouring keyframes; the rows are those of `ImuFactor`.
 
-    readings: of the mounted IMU, corrected for its size effect. imu, gravity: readings of the body, and gravity [m/s^2]
+    readings: of the mounted IMU, corrected for effects on them. imu, gravity: readings of the body, and gravity [m/s^2]
     where the state has none. seconds (K,): keyframes on its clock when the factor was built. increments: W is zero
     where it has no readings, but for the biases. values0: free parameters then. state_column: of its velocity and
     biases in a keyframe.
@@ -91,9 +92,9 @@ class MountedImuFactor(RowFactor):
         intrinsics, bias = state.values[name, "intrinsics"], _imu_states(layout, state, name)[:, 3:]
         usable = readings.covers(seconds[:-1], seconds[1:]) & clear_of(readings.seams, seconds[:-1], seconds[1:])
         usable[np.array(state.starts[1:], dtype=np.int64) - 1] = False
-        n_columns = len(free_columns(layout, name))
-        readings = without_size_effect(readings, state, bias[:, :3].mean(axis=0))
-        increments = preintegrated_with_jacobians(readings, seconds, usable, bias, intrinsics, n_columns)
+        groups = free_groups(layout, name)
+        readings = without_effects(readings, state, bias[:, :3].mean(axis=0))
+        increments = preintegrated_with_jacobians(readings, seconds, usable, bias, intrinsics, groups)
         R = state.rotation @ state.values[name, "rotation"]
         # Zero residual without readings: Log of an arbitrary rotation may have no derivative.
         increments.dR[~usable] = (R[:-1].transpose(0, 2, 1) @ R[1:])[~usable]
@@ -108,7 +109,7 @@ class MountedImuFactor(RowFactor):
             layout,
             seconds,
             increments,
-            free_values(state, name, n_columns),
+            free_values(state, name, groups),
             state.starts,
         )
 
@@ -181,7 +182,7 @@ class MountedImuFactor(RowFactor):
         m = k.stop - k.start
         r = np.empty((m, N_ROWS))
         J_imu = np.zeros((m if jacobians else 0, N_ROWS, 2 * KEYFRAME_DIM + n_free + len(gravity)))
-        dx = free_values(state, self.name, n_free) - self.values0
+        dx = free_values(state, self.name, free_groups(self.layout, self.name)) - self.values0
         _linearise(k.start, k.stop, chain, self.increments, dx, len(gravity), r, J_imu)
         dim, n_pose = self.layout.keyframe_dim, at.n_calib
         J = np.zeros((len(J_imu), N_ROWS, 2 * dim + n_pose + n_free + len(gravity)))

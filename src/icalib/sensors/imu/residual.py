@@ -16,7 +16,7 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.geometry.small import inverse_cholesky, mul3, tmul3
 from icalib.motion.factor import FactorKey, RowFactor, Whitened
-from icalib.motion.imu_data import N_SIZE_EFFECT, ImuData, size_effect_matrix
+from icalib.motion.imu_data import ImuData, reading_effect
 from icalib.motion.integration import Increment, bias_of, integrate, integration_workspace, readings_of
 from icalib.motion.integration_step import COVARIANCE_SIZE, correction
 from icalib.motion.poses import gravity_of
@@ -24,12 +24,12 @@ from icalib.optim import memory
 from icalib.optim.arrowhead import Piece, accumulate_bias_prior, in_parallel
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, add_product, whiten
 from icalib.optim.state import KEYFRAME_DIM, Layout, State
-from icalib.sensors.imu.spec import N_INTRINSICS
+from icalib.rig.scene import GRAVITY, WORLD
+from icalib.sensors.imu.spec import EFFECTS, INTRINSICS, N_INTRINSICS
 
 N_ROWS = 15  # of an interval
 IS_LENGTH = np.array([False] * 3 + [True] * 6 + [False] * 3 + [True] * 3)  # (15,) rows in m, m/s and m/s^2
 NONE = np.zeros(0, dtype=np.int64)
-SIZE_EFFECT_STEP_M = 1e-2  # of difference quotients of increments, which are linear
 KINDS = {"gyroscope": slice(0, 3), "accelerometer": slice(3, 9), "bias walk": slice(9, N_ROWS)}
 
 
@@ -60,7 +60,7 @@ class Increments(NamedTuple):
     """K - 1 preintegrated intervals, in the axes of their first keyframe.
 
     dR (K - 1, 3, 3), dv [m/s], dp [m] (K - 1, 3), at the biases bias0 (K, 6); J (K - 1, 9, 6 + p): their Jacobians by
-    biases and p free parameters, see `GROUPS`; W (K - 1, 15, 15): inverse Cholesky factor of the covariance, which
+    biases and p free parameters, see `free_groups`; W (K - 1, 15, 15): inverse Cholesky factor of the covariance, which
     whitens the rows.
     """
 
@@ -88,45 +88,44 @@ def preintegrated(
     return Increments(*arrays, bias)
 
 
-# Free groups of an IMU's parameters by their number of calibration columns, in the order of the columns.
-GROUPS: dict[int, tuple[str, ...]] = {
-    0: (),
-    N_SIZE_EFFECT: ("size_effect",),
-    N_INTRINSICS: ("intrinsics",),
-    N_INTRINSICS + N_SIZE_EFFECT: ("intrinsics", "size_effect"),
-}
+def free_groups(layout: Layout, imu: str) -> tuple[str, ...]:
+    """Free groups of the parameters of an IMU, in the order of their columns."""
+    groups = (spec.name for spec in (INTRINSICS, *EFFECTS))
+    return tuple(g for g in groups if layout.has(imu, g) and layout.is_free(imu, g))
 
 
 def free_columns(layout: Layout, imu: str) -> np.ndarray:
-    """Calibration columns of the free parameters of an IMU, see `GROUPS`."""
-    free = [g for g in ("intrinsics", "size_effect") if layout.has(imu, g) and layout.is_free(imu, g)]
-    return layout.columns(imu, *free) if free else NONE
+    """Calibration columns of `free_groups`."""
+    groups = free_groups(layout, imu)
+    return layout.columns(imu, *groups) if groups else NONE
 
 
-def free_values(state: State, imu: str, n_columns: int) -> np.ndarray:
-    """(n_columns,) values of the free parameters of an IMU, see `GROUPS`."""
-    return np.concatenate([np.zeros(0), *(state.values[imu, group] for group in GROUPS[n_columns])])
+def free_values(state: State, imu: str, groups: tuple[str, ...]) -> np.ndarray:
+    """(p,) values of the free parameters of an IMU."""
+    return np.concatenate([np.zeros(0), *(state.values[imu, group] for group in groups)])
 
 
 def preintegrated_with_jacobians(
-    imu: ImuData, seconds: np.ndarray, usable: np.ndarray, bias: np.ndarray, intrinsics: np.ndarray, n_columns: int
+    imu: ImuData,
+    seconds: np.ndarray,
+    usable: np.ndarray,
+    bias: np.ndarray,
+    intrinsics: np.ndarray,
+    groups: tuple[str, ...],
 ) -> Increments:
-    """As `preintegrated`, with Jacobians by all free parameters, see `GROUPS`. The size effect changes the readings of
-    the accelerometer, in which increments are linear; with g-sensitivity, to first order."""
-    groups = GROUPS[n_columns]
-    n_intrinsics = N_INTRINSICS if "intrinsics" in groups else 0
-    made = preintegrated(imu, seconds, usable, bias, intrinsics, n_intrinsics)
-    if "size_effect" not in groups:
-        return made
-    J_reading = size_effect_matrix(imu, bias[:, :3].mean(axis=0))
-    J = np.concatenate([made.J, np.zeros((len(made.J), 9, N_SIZE_EFFECT))], axis=2)
-    for k in range(N_SIZE_EFFECT):
-        step = replace(imu, accel=np.ascontiguousarray(imu.accel - SIZE_EFFECT_STEP_M * J_reading[:, :, k]))
-        moved = preintegrated(step, seconds, usable, bias, intrinsics, 0)
-        turned = so3.log_many(np.ascontiguousarray(made.dR.transpose(0, 2, 1) @ moved.dR))
-        change = np.concatenate([turned, moved.dv - made.dv, moved.dp - made.dp], axis=1)
-        J[:, :, J.shape[2] - N_SIZE_EFFECT + k] = change / SIZE_EFFECT_STEP_M
-    return made._replace(J=J)
+    """As `preintegrated`, with Jacobians by the parameters of the free `groups`. Effects change the readings, in which
+    increments are linear; with g-sensitivity, to first order."""
+    made = preintegrated(imu, seconds, usable, bias, intrinsics, N_INTRINSICS if INTRINSICS.name in groups else 0)
+    columns = [made.J]
+    for effect in (spec for spec in EFFECTS if spec.name in groups):
+        J_reading, step = reading_effect(imu, effect, bias[:, :3].mean(axis=0)), effect.prior_sigma
+        for k in range(J_reading.shape[2]):
+            gyro, accel = imu.gyro - step * J_reading[:, :3, k], imu.accel - step * J_reading[:, 3:, k]
+            moved = preintegrated(replace(imu, gyro=gyro, accel=accel), seconds, usable, bias, intrinsics, 0)
+            turned = so3.log_many(np.ascontiguousarray(made.dR.transpose(0, 2, 1) @ moved.dR))
+            change = np.concatenate([turned, moved.dv - made.dv, moved.dp - made.dp], axis=1)
+            columns.append(change[:, :, None] / step)
+    return made if len(columns) == 1 else made._replace(J=np.concatenate(columns, axis=2))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -261,10 +260,12 @@ class ImuFactor(RowFactor):
 
     imu: ImuData
     gravity: float  # [m/s^2], where the state has none
-    columns: np.ndarray  # calibration columns of free parameters, see `GROUPS`, and that of the unit of length if any
+    layout: Layout
+    groups: tuple[str, ...]  # free parameters, see `free_groups`
+    columns: np.ndarray  # their calibration columns, and that of the unit of length if any
     gravity_column: np.ndarray  # (1,) that of the magnitude of gravity, or (0,)
     increments: Increments
-    values0: np.ndarray  # of free parameters, at which the intervals were preintegrated, see `GROUPS`
+    values0: np.ndarray  # of free parameters, at which the intervals were preintegrated
     starts: tuple[int, ...] = (0,)
 
     @property
@@ -303,26 +304,26 @@ class ImuFactor(RowFactor):
         return sum(accumulate_bias_prior(state, piece, sums, self.increments.bias0[k], k) for k in keyframes)
 
     @classmethod
-    def build(
-        cls, imu: ImuData, state: State, gravity: float, columns: np.ndarray, gravity_column: np.ndarray = NONE
-    ) -> ImuFactor:
+    def build(cls, imu: ImuData, state: State, gravity: float, layout: Layout) -> ImuFactor:
         """Preintegrates all intervals at the biases and intrinsics of `state`."""
         bias0, intrinsics = state.bias.copy(), state.values[imu.name, "intrinsics"].copy()
         seams = np.array(state.starts[1:], dtype=np.int64) - 1
-        n_columns = len(columns) - (imu.unit is not None)
+        groups, gravity_key = free_groups(layout, imu.name), (WORLD, GRAVITY.name)
+        columns = np.concatenate([free_columns(layout, imu.name), imu.unit_columns(layout)])
+        gravity_column = layout.columns(*gravity_key) if layout.has(*gravity_key) else NONE
         usable = ~np.isin(np.arange(len(state.seconds) - 1), seams)
-        increments = preintegrated_with_jacobians(imu, state.seconds, usable, bias0, intrinsics, n_columns)
+        increments = preintegrated_with_jacobians(imu, state.seconds, usable, bias0, intrinsics, groups)
         # Zero residual between recordings: Log of an arbitrary rotation may have no derivative.
         increments.dR[seams] = state.rotation[seams].transpose(0, 2, 1) @ state.rotation[seams + 1]
-        values = free_values(state, imu.name, n_columns)
-        return cls(imu, gravity, columns, gravity_column, increments, values, state.starts)
+        values = free_values(state, imu.name, groups)
+        return cls(imu, gravity, layout, groups, columns, gravity_column, increments, values, state.starts)
 
     def with_imu(self, imu: ImuData, state: State) -> ImuFactor:
-        return ImuFactor.build(imu, state, self.gravity, self.columns, self.gravity_column)
+        return ImuFactor.build(imu, state, self.gravity, self.layout)
 
     def accumulate(self, state: State, piece: Piece, out: Whitened, sums: bool = True, curved: bool = False) -> float:
         """See `Factor`; `curved` has no effect, as there is no robust loss."""
-        dx = free_values(state, self.imu.name, len(self.values0)) - self.values0
+        dx = free_values(state, self.imu.name, self.groups) - self.values0
         gravity = gravity_of(state, self.gravity)
         chain = Chain(state.rotation, state.position, state.velocity, state.bias, state.seconds, gravity)
         unit, columns = self.imu.unit_length(state), np.concatenate([self.columns, self.gravity_column])

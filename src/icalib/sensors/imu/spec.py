@@ -80,6 +80,12 @@ INTRINSICS = ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSIC
 SIZE_EFFECT = ParameterSpec(
     "size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3, is_effect=True
 )
+ACCEL_DELAY = ParameterSpec("accel_delay", 1, "nuisance", "s", ("accel_delay",), 1e-3, 1e-3, is_effect=True)
+LOW_PASS = ParameterSpec(
+    "low_pass", 1, "nuisance", "s^2", ("low_pass",), 1e-4, 1e-5, is_effect=True, is_considered=True
+)
+# Effects on the readings, see `motion.imu_data`. None is in the model, and the rig file has no field for LOW_PASS.
+EFFECTS = (SIZE_EFFECT, ACCEL_DELAY, LOW_PASS)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
 # consumer: Bosch BMI160 of the TUM VI data set (Schubert et al., IROS 2018), as OpenVINS sets it for that data set.
@@ -151,11 +157,12 @@ class TwoSources:
 
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
-ONE_PLACE = Parameter("fixed")  # all axes of the accelerometer
+IDEAL = Parameter("fixed")  # without an effect
 BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
+_EFFECTS = (SIZE_EFFECT.name, ACCEL_DELAY.name)
 _MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
 
 
@@ -170,22 +177,21 @@ class ImuSensor(MountedSensor):
     assumed: no real IMU, but an assumption of smooth motion (see `initialize.assumed_motion`). intrinsics (24,): see
     `motion.imu_data`. Their default prior is that of the IMU's class about the ideal IMU. Free intrinsics have a broad
     prior about the initial guess. Intrinsics fixed without a value are those of the ideal IMU. size_effect (6,): places
-    [m] of the accelerometer's y and z axes relative to that of x; fixed without a value: all at one place.
+    [m] of the accelerometer's y and z axes relative to that of x; fixed without a value: all at one place. accel_delay
+    [s], low_pass [s^2]: see `motion.imu_data`.
     """
 
     sensor_type: ClassVar[str] = "imu"
     noun: ClassVar[str] = "IMU"
     is_inertial: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (
-        *MOUNTED,
-        INTRINSICS,
-        SIZE_EFFECT,
-    )
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, *EFFECTS)
 
     path: str | TwoSources
     noise: ImuNoise
     intrinsics: Parameter = BY_CLASS
-    size_effect: Parameter = ONE_PLACE
+    size_effect: Parameter = IDEAL
+    accel_delay: Parameter = IDEAL
+    low_pass: Parameter = IDEAL
     topic: str | TwoSources | None = None  # in a bag; None: the one with the sensor's name, or the only one
     accel_unit: AccelUnit | None = None
     gyro_unit: GyroUnit | None = None
@@ -206,29 +212,28 @@ class ImuSensor(MountedSensor):
         elif self.intrinsics.mode == "free":
             start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
             object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
-        if self.size_effect.mode == "free":
-            start = np.zeros(SIZE_EFFECT.size) if self.size_effect.value is None else self.size_effect.value
-            sigma = np.full(SIZE_EFFECT.size, SIZE_EFFECT.prior_sigma)
-            object.__setattr__(self, "size_effect", Parameter("prior", start, sigma))
+        for spec in EFFECTS:
+            if (effect := getattr(self, spec.name)).mode == "free":
+                start = np.zeros(spec.size) if effect.value is None else effect.value
+                prior = Parameter("prior", start, np.full(spec.size, spec.prior_sigma))
+                object.__setattr__(self, spec.name, prior)
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Sensor`; extrinsics and time offset only where `mounted`, the size effect only where the rig file has
-        it."""
-        has_size = self.size_effect.mode != "fixed" or self.size_effect.value is not None
+        """See `Sensor`; extrinsics and time offset only where `mounted`, effects only where the rig file has them."""
         specs = self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
-        return specs if has_size else specs[:-1]
+        parameters: dict[str, Parameter] = vars(self)
+        ideal = [s for s in EFFECTS if (p := parameters[s.name]).mode == "fixed" and p.value is None]
+        return tuple(spec for spec in specs if spec not in ideal)
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> ImuSensor:
-        fields = value.record(
-            ("type",), ("path", "topic", "noise", "intrinsics", "size_effect", *_FIELDS, *TABLE, *_MOUNT)
-        )
+        fields = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_EFFECTS, *_FIELDS, *TABLE, *_MOUNT))
         units: dict[str, Any] = {
             field: fields[field].choice("such unit as", get_args(kind))
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups = parameters(fields, (*MOUNTED, SIZE_EFFECT))
+        groups = parameters(fields, (*MOUNTED, SIZE_EFFECT, ACCEL_DELAY))
         if "intrinsics" in fields:
             groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(
