@@ -63,7 +63,7 @@ def test_the_table_is_whole_in_80_columns(record):
     assert sum("wheel0 " in r for r in rows) == 4 and len(rows) < 17
 
 
-def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys):
+def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys, assert_drawn):
     assert main(["reproduce", "--runs", "8", "--output", str(tmp_path)]) == 0
     page = (tmp_path / "reproduce.html").read_text()
     for motion, title in MOTIONS.items():
@@ -71,6 +71,7 @@ def test_reproduce_leaves_figures_and_tables(runs, tmp_path: Path, capsys):
         assert f"<h2>{title}</h2>" in page and f'id="{motion}-cam0.rotation"' in page
         assert (tmp_path / motion / "consistency.json").exists()
     assert "reproduce.html" in capsys.readouterr().out
+    assert_drawn(page, {f"{motion}-cam0.rotation" for motion in MOTIONS})
 
 
 def test_reproduce_without_any_good_run_still_reports(tmp_path: Path, monkeypatch, capsys):
