@@ -136,16 +136,14 @@ def _templates() -> Environment:
 def document(template: str, plots: Iterable[Plot], /, **values: object) -> str:
     """One HTML file, plotly.js included, from a template of the package, such as "report/page.html". plots: those that
     it shows; values: what else it names. Text is escaped."""
-    return (
-        _templates()
-        .get_template(template)
-        .render(
-            figures=_packed(json.dumps({plot.name: plot.figure for plot in plots}, allow_nan=False)),
-            css=Markup(resource("icalib.report", "page.css")),
-            plotly=_plotly(),
-            **values,
-        )
-    )
+    figures = _packed(json.dumps({plot.name: plot.figure for plot in plots}, allow_nan=False))
+    return render(template, figures=figures, plotly=_plotly(), **values)
+
+
+def render(template: str, /, **values: object) -> str:
+    """A template of the package with `values`, and the style of all pages. Text is escaped."""
+    css = Markup(resource("icalib.report", "page.css"))
+    return _templates().get_template(template).render(css=css, **values)
 
 
 @cache
@@ -230,7 +228,7 @@ def report_html(calibration: Calibration) -> str:
 
 def summary_html(c: Calibration) -> str:
     """The verdict with its reasons, and a table of all parameters, as HTML for a notebook."""
-    return _templates().get_template("report/summary.html").render(c=c, rows=table_rows(c))
+    return render("report/summary.html", c=c, rows=table_rows(c))
 
 
 TRUST: dict[Usability, str] = {

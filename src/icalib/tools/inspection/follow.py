@@ -14,9 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from html import escape
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from importlib.resources import files
 from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -40,6 +38,7 @@ from icalib.errors import CalibrationError, RecordingError
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
 from icalib.pipeline import calibrate_measurements
+from icalib.report.page import render
 from icalib.result import ParameterGroup
 from icalib.rig import ImuSensor, Rig, Sensor
 from icalib.rig.file import load_rig, rig_from_dict
@@ -656,7 +655,7 @@ class Page:
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._body = ""
-        page, frame = self, files("icalib.tools.inspection").joinpath("follow.html").read_text("utf-8")
+        page, frame = self, render("tools/inspection/follow.html")
 
         class Handler(BaseHTTPRequestHandler):
             def do_GET(self) -> None:
@@ -680,21 +679,8 @@ class Page:
 
     def show(self, now: View) -> None:
         """Replaces the content."""
-        advice = "".join(f"<li>{escape(sentence)}</li>" for sentence in now.advice)
-        tables = "".join(_html(grid) for grid in now.tables)
-        title = "{}: corners over the image"
-        maps = "".join(
-            f"<figure><figcaption>{escape(title.format(name))}</figcaption><pre>{cells}</pre></figure>"
-            for name, cells in now.coverage
-        )
-        self._body = f"<h1>{escape(now.title)}</h1><ol>{advice}</ol>{tables}<div class=maps>{maps}</div>"
+        self._body = render("tools/inspection/follow_body.html", now=now)
 
     def close(self) -> None:
         self._server.shutdown()
         self._server.server_close()
-
-
-def _html(grid: Grid) -> str:
-    head = "".join(f"<th>{escape(h)}</th>" for h in grid.headers)
-    rows = "".join("<tr>" + "".join(f"<td>{escape(c)}</td>" for c in row) + "</tr>" for row in grid.rows)
-    return f"<section><h2>{escape(grid.title)}</h2><table><tr>{head}</tr>{rows}</table></section>"
