@@ -257,9 +257,11 @@ def _ellipsoid_words(c: Calibration) -> str:
     """Legend of the uncertainty ellipsoids; empty if no translation was estimated."""
     if not ellipsoids(c):
         return ""
+    factor = magnification(c)
+    size = f"{factor:g} times as large as they are" if factor > 1.0 else "as large as they are"
     return (
         f" Ellipsoids of green, amber or red lines show where a sensor may be: {SIGMAS:g} standard deviations of its "
-        f"position, {magnification(c):g} times as large as they are; red ones are not determined. "
+        f"position, {size}; red ones are not determined. "
         "Those larger than the rig are cut."
     )
 
