@@ -259,6 +259,17 @@ def test_reasons_stand_in_their_order_and_once(calibration: Calibration):
     assert page.count("it is too large.") == 1 and "Not usable. Act on the first reason" in page
 
 
+@pytest.mark.parametrize(("count", "folded"), [(3, 0), (4, 0), (5, 2), (9, 6)])
+def test_of_many_reasons_the_first_three_are_on_the_first_screen(calibration: Calibration, count: int, folded: int):
+    known = calibration.reasons
+    more = tuple(remark(f"reason {k}.") for k in range(count - len(known)))
+    c = dataclasses.replace(calibration, warnings=(*calibration.warnings, *more))
+    assert len(c.reasons) == count
+    page = report_html(c)
+    assert (f"<summary>{folded} more reasons</summary>" in page) == bool(folded)
+    assert page.count('start="4"') == bool(folded) and all(f">reason {k}.<" in page for k in range(len(more)))
+
+
 def test_a_poor_fit_colours_the_card(calibration: Calibration):
     """Residuals twice and five times as large as stated, of a camera whose parameters are determined."""
     groups = tuple(dataclasses.replace(g, verdict=("determined",) * len(g.verdict)) for g in calibration.groups)
