@@ -60,6 +60,12 @@ def test_a_bag_of_chunks_is_read_once_as_it_grows(form: BagForm, tmp_path: Path)
     assert parts_of(source) == []
 
 
+def test_a_long_file_comes_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("icalib.data.bag_recording.PART_BYTES", 10_000)
+    found = parts_of(not_none(open_growing_recording(written("mcap", tmp_path / "whole"))))
+    assert len(found) > 10 and stamps(found, "/imu0") == [1 + k * STEP_NS for k in range(COUNT)]
+
+
 def test_what_a_killed_writer_left_is_read(tmp_path: Path):
     file = written("mcap", tmp_path / "whole")
     file.write_bytes(file.read_bytes()[:-2000])
@@ -121,6 +127,7 @@ def _rows(file: Path) -> dict[str, list[Any]]:
 def test_files_that_a_recorder_adds_are_read(tmp_path: Path):
     folder = tmp_path / "run"
     folder.mkdir()
+    (folder / "metadata.yaml").touch()
     assert open_growing_recording(folder) is None
     first = written("mcap", tmp_path / "whole")
     shutil.copy(first, folder / "run_0.mcap")

@@ -11,7 +11,6 @@ from array import array
 from collections.abc import Callable, Iterator, Sequence, Set
 from dataclasses import dataclass, field, replace
 from functools import cache
-from itertools import chain
 from pathlib import Path
 from typing import Any, final
 
@@ -434,15 +433,17 @@ class GrowingBag:
         """See `Growing`."""
         rows: list[tuple[int, int, bytes]] = []
         size = 0
-        self._rows = chain(self._rows, self._new_rows())
-        for row in self._rows:
-            rows.append(row)
-            size += len(row[2])
-            if size > PART_BYTES:
-                break
-        else:
-            self._rows = iter(())
-        return MessagePart(self._root, {n: c for c, n in self._keys.items()}, rows) if rows else None
+        for is_new in (False, True):
+            self._rows = self._new_rows() if is_new else self._rows
+            for row in self._rows:
+                rows.append(row)
+                size += len(row[2])
+                if size > PART_BYTES:
+                    return self._part(rows)
+        return self._part(rows) if rows else None
+
+    def _part(self, rows: list[tuple[int, int, bytes]]) -> MessagePart:
+        return MessagePart(self._root, {number: connection for connection, number in self._keys.items()}, rows)
 
     def _new_rows(self) -> Iterator[tuple[int, int, bytes]]:
         """Messages of all files since the last look. Copies that the recorder compressed as a whole are left out."""

@@ -75,7 +75,8 @@ def open_growing_recording(path: Path) -> Growing | None:
     """The recording that is being written at `path`; None while nothing is there."""
     if path.is_file() or (path.is_dir() and bag_files(path)):
         return GrowingBag(path)
-    return GrowingFolder(path) if path.is_dir() and any(path.iterdir()) else None
+    tables_or_sensors = path.is_dir() and any(p.is_dir() or p.suffix == ".csv" for p in path.iterdir())
+    return GrowingFolder(path) if tables_or_sensors else None
 
 
 def _refuse_unreadable(folder: Path) -> None:

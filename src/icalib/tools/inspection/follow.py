@@ -12,9 +12,10 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import closing, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import groupby
 from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -121,9 +122,11 @@ def predict(problem: CoarseProblem) -> Expectation:
     rig = problem.rig.with_("settings", images_in_report=False)
     try:
         measured = _measurements(problem, rig)
-        whole = calibrate_measurements(rig, measured)
-        half = measured.with_streams(*(_every_second(c) for c in measured.cameras))
-        halved = calibrate_measurements(rig.with_("settings", segments=0), half) if problem.density > 1.0 else whole
+        whole = halved = calibrate_measurements(rig, measured)
+        if problem.density > 1.0:
+            half = measured.with_streams(*(_every_second(c) for c in measured.cameras))
+            with suppress(CalibrationError):  # too few: then more images count for nothing
+                halved = calibrate_measurements(rig.with_("settings", segments=0), half)
     except Exception as error:  # the recording goes on, and another minute may be fit
         return Expectation(problem.seconds, problem=sentence_on(error))
     groups = [g for g in whole.groups if g.sensor in rig.sensors and g.mode != "fixed"]
@@ -277,6 +280,10 @@ class Motion:
         """(3,) RMS angular rate [rad/s] about the axes of a sensor."""
         turning = R_imu_sensor.T @ self.turning @ R_imu_sensor
         return np.sqrt(np.maximum(np.diag(turning), 0.0) / max(self.seconds, 1e-9))
+
+    def least_turned(self, R_imu_sensor: np.ndarray) -> str:
+        """Name of the axis of a sensor about which it turned least."""
+        return "xyz"[int(np.argmin(self.rates(R_imu_sensor)))]
 
     def shaking(self) -> np.ndarray:
         """(3,) RMS of the specific force about its mean [m/s^2], imu frame."""
@@ -488,8 +495,8 @@ class View:
     @property
     def line(self) -> str:
         """The state in one line."""
-        rows = self.tables[0].rows
-        sensors = ", ".join(f"{row[0]} {row[2]}" + f" ({row[5]} with target)" * bool(row[5]) for row in rows)
+        words = (f"{row[0]} {row[2]}" + f" ({row[5]} with target)" * bool(row[5]) for row in self.tables[0].rows)
+        sensors = ", ".join(words)
         return f"{self.title}: {sensors or 'nothing has arrived'}. {self.advice[0] if self.advice else ''}".rstrip()
 
 
@@ -532,7 +539,8 @@ def _moved(f: Follower, prediction: Expectation | None) -> Grid:
 def _expected_table(prediction: Expectation) -> Grid:
     """Standard deviations of extrinsics, time offsets and lenses, one row for each group."""
     rows = []
-    for (sensor, group), stds in _by_group(prediction).items():
+    for (sensor, group), alike in groupby(prediction.stds, key=lambda s: (s.sensor, s.group)):
+        stds = list(alike)
         unit, factor = display_unit(stds[0].unit)
         needed = max(s.needed_s for s in stds)
         state = "determined" if needed == 0.0 else f"{needed:.0f} s more" if np.isfinite(needed) else "move otherwise"
@@ -542,13 +550,6 @@ def _expected_table(prediction: Expectation) -> Grid:
         rows.append((sensor, f"{name} [{unit}]", values, tolerance, state))
     title = f"Expected standard deviations, from the first {prediction.seconds:.0f} s"
     return Grid(title, ("sensor", "parameter", "std", "tolerance", "until determined"), tuple(rows))
-
-
-def _by_group(prediction: Expectation) -> dict[tuple[str, str], list[ExpectedStd]]:
-    groups: dict[tuple[str, str], list[ExpectedStd]] = {}
-    for s in prediction.stds:
-        groups.setdefault((s.sensor, s.group), []).append(s)
-    return groups
 
 
 def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
@@ -568,6 +569,9 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
         yield "Keep moving: there is too little yet for a prediction."
     elif prediction.problem:
         yield f"No prediction yet: {prediction.problem}"
+        if f.motion.count:
+            axis = f.motion.least_turned(np.eye(3))
+            yield f"{next(iter(f.sensors))} turned least about its {axis} axis so far; turn about it, too."
     else:
         yield from _next_motion(f, prediction)
     for name, a in cameras.items():
@@ -585,10 +589,9 @@ def _next_motion(f: Follower, prediction: Expectation) -> Iterator[str]:
     worst = max(weak, key=lambda s: s.std / s.tolerance)
     more = f", {worst.needed_s:.0f} s more" if np.isfinite(worst.needed_s) else ""
     if worst.group == TIME_OFFSET.name or not f.motion.count or worst.sensor not in prediction.rotations:
-        what = worst.group.replace("_", " ")
-        yield f"Turn and shake the rig faster, to and fro{more}, for the {what} of {worst.sensor}."
+        yield f"Turn and shake the rig faster, to and fro{more}; {worst.sensor} needs it."
         return
-    axis = "xyz"[int(np.argmin(f.motion.rates(prediction.rotations[worst.sensor])))]
+    axis = f.motion.least_turned(prediction.rotations[worst.sensor])
     yield f"Turn about the {axis} axis of {worst.sensor}{more}, for its {worst.group} {worst.label}."
 
 
@@ -599,22 +602,16 @@ SILENT_S = 5.0  # recorders write a chunk more often
 LINE_EVERY_S = 5.0  # between lines where there is no terminal
 
 
-def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | None, out: Console | None = None) -> None:
+def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | None) -> None:
     """Shows the recording at `root` while it grows, until it is interrupted. address: of the page; None: no page.
 
     Raises CalibrationError if the address cannot be used."""
-    console, follower, solver = out or Console(), Follower(root, given), Solver()
-    page = None if address is None else Page(address)
-    try:
+    console, follower = Console(), Follower(root, given)
+    with closing(Page(address)) if address else nullcontext() as page, closing(Solver()) as solver:
         if page is not None:
             console.print(f"Page: http://{page.host}:{page.port}/", markup=False, highlight=False)
-        _show(follower, solver, page, console)
-    except KeyboardInterrupt:
-        pass
-    finally:
-        solver.close()
-        if page is not None:
-            page.close()
+        with suppress(KeyboardInterrupt):
+            _show(follower, solver, page, console)
     console.print(view(follower, solver.latest).line, markup=False, highlight=False)
 
 
