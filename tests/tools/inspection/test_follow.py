@@ -127,6 +127,14 @@ def test_a_rig_file_names_the_sensors(filmed: Path, tmp_path: Path):
     )
 
 
+def test_a_rig_without_a_target_is_followed(filmed: Path, tmp_path: Path):
+    path = tmp_path / "rig.yaml"
+    path.write_text("sensors:\n  imu: {type: imu, topic: /imu0}\n  lidar0: {type: lidar}\n")
+    follower = Follower(filmed, read_target(path))
+    assert follower.look() and list(follower.sensors) == ["imu"] and follower.motion.count > 0
+    assert follower.coarse_problem() is None
+
+
 def every(c: CornerStream, n: int) -> CornerStream:
     kept = np.arange(len(c.stamps_ns)) % n == 0
     return c.of_rows(kept[c.image], c.stamps_ns[kept], np.diff(c.start)[kept])
@@ -217,7 +225,7 @@ def test_a_target_out_of_view_is_said_first(target: Path):
     assert view(f, None).advice[0] == "The target is not in view of cam0; bring it into view."
     f = Follower(Path("run.mcap"))
     assert view(f, None).advice == (
-        "Give the target, or the rig file, with --target FILE: then standard deviations are predicted.",
+        "Standard deviations are predicted with a target; give it, or its rig file, with --target FILE.",
     )
 
 

@@ -33,9 +33,9 @@ from icalib.data.recording import Growing, NewPart
 from icalib.data.recordings import DamagedImageError, Recording, decode, open_growing_recording, read_measurements
 from icalib.data.stamps import LONGEST_S
 from icalib.detection.decoding import ImageCorners, corner_stream
-from icalib.detection.detectors import detector_of
+from icalib.detection.detectors import Detector, detector_of
 from icalib.detection.images import number_continuously, without_rare_tags
-from icalib.errors import CalibrationError, RecordingError
+from icalib.errors import CalibrationError, RecordingError, RigError
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
 from icalib.pipeline import calibrate_measurements
@@ -313,9 +313,11 @@ class Follower:
         self.topics: dict[str, Arrivals] = {}
         self.sensors: dict[str, TopicInfo] = {}
         self.motion, self.seconds, self.problem = Motion(), 0.0, ""
-        self.target = None if given is None else given.target
+        self.target = given.target if given is not None and len(given.target.bodies) else None
         self._stated = load_rig(given.file) if given is not None and given.sensors else None
-        self._detector = None if self.target is None else detector_of(self.target)
+        self._detector: Detector | None = None
+        with suppress(RigError):  # a target whose corners come as a table
+            self._detector = None if self.target is None else detector_of(self.target)
         self._kept: deque[Kept] = deque()
         self._source: Growing | None = None
         self._began = time.monotonic()
@@ -560,7 +562,7 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     elif late > SILENT_S:
         yield f"Nothing has arrived for {late:.0f} s: the recorder has ended, or its disk is full."
     if f.target is None:
-        yield "Give the target, or the rig file, with --target FILE: then standard deviations are predicted."
+        yield "Standard deviations are predicted with a target; give it, or its rig file, with --target FILE."
         return
     cameras = {name: f.topics[t.name] for name, t in f.sensors.items() if t.kind == "image"}
     if any(a.searched for a in cameras.values()) and not any(a.sees for a in cameras.values()):
@@ -622,7 +624,10 @@ def _show(follower: Follower, solver: Solver, page: Page | None, console: Consol
         while True:
             begin = time.monotonic()
             follower.look()
-            solver.offer(follower.coarse_problem)
+            try:
+                solver.offer(follower.coarse_problem)
+            except CalibrationError as error:  # such as images of one camera with the same stamp
+                follower.problem = str(error)
             if begin - drawn >= REFRESH_S:
                 drawn, now = begin, view(follower, solver.latest)
                 if page is not None:
