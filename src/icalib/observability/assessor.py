@@ -11,6 +11,7 @@ import numpy as np
 from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
+from icalib.estimate.problem import Problem
 from icalib.estimate.residual_statistics import Segments
 from icalib.kinds import assessors
 from icalib.observability.prior_sensitivity import Effect, Relaxed
@@ -50,7 +51,8 @@ class Cause:
 class AssessedEstimate:
     """An estimate with its statistics. factor: the largest empirical factor, which multiplies formal standard
     deviations; segments: of the recording, None if it is not split. effects: that the estimate leaves out.
-    relaxed_rig: the estimate without fixed values; None if it is not known."""
+    beside: problem with these and with fixed values free, and the solution. relaxed_rig: the estimate without fixed
+    values; None if it is not known."""
 
     inputs: Inputs
     estimate: Estimate
@@ -60,6 +62,7 @@ class AssessedEstimate:
     segments: Segments | None
     timeline: Timeline
     effects: tuple[Effect, ...]
+    beside: tuple[Problem, State]
     relaxed_rig: Relaxed | None = None
 
     @property

@@ -451,10 +451,12 @@ class Effect:
 
 class EffectsLeftOut(NamedTuple):
     """Effects that an estimate leaves out: all that were tested; and for each effect that is considered the shift (B,)
-    of the calibration parameters whose outer product adds to their covariance."""
+    of the calibration parameters whose outer product adds to their covariance. beside: problem with these effects and
+    with fixed values free, and the solution; rates of clocks are fixed, as they are changes, too. None: no effects."""
 
     tested: tuple[Effect, ...] = ()
     shifts: Mapping[Key, np.ndarray] = MappingProxyType({})
+    beside: tuple[Problem, State] | None = None
 
 
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
@@ -467,7 +469,11 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     if not specs or (linearised := _linearised(freed, estimate, single)) is None:
         return EffectsLeftOut()
     freed_estimate = _FreedEstimate(inputs.layout, *linearised)
-    return EffectsLeftOut(freed_estimate.effects(specs, freed), freed_estimate.considered(specs))
+    problem, state, *_ = linearised
+    rates = [problem.layout.columns(*key) for key, spec in specs.items() if spec is CLOCK_RATE]
+    fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
+    beside = replace(problem, fixed_directions=fixed), state
+    return EffectsLeftOut(freed_estimate.effects(specs, freed), freed_estimate.considered(specs), beside)
 
 
 def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:

@@ -81,8 +81,9 @@ def assess(
     factors = _factors(inputs, groups)
     sensor_fits = _sensor_fits(inputs, estimate)
     assessed = AssessedEstimate(
-        inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline, left_out.tested
-    )
+        inputs, estimate, groups, sensor_fits, factors.max(initial=1.0), segments, timeline, left_out.tested,
+        left_out.beside or (estimate.problem, estimate.outcome.state),
+    )  # fmt: skip
     causes, size_notes = all_causes(assessed, against)
     grave = tuple(c.sentence for c in causes if c.grave)
     warnings = (

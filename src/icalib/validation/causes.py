@@ -12,6 +12,7 @@ from icalib.data.measurements import ImuStream
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs
 from icalib.estimate.parameter_changes import NO_CHANGES, Change, Changes, changes
+from icalib.estimate.problem import Problem
 from icalib.estimate.residual_statistics import rows_of
 from icalib.kinds import assessors
 from icalib.motion.factor import FitKey
@@ -19,7 +20,7 @@ from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Cause, Remedy, assessments
 from icalib.observability.contradictions import SIGMAS, Contradiction, contradictions
 from icalib.observability.prior_sensitivity import Relaxed, relaxed
-from icalib.optim.state import Key
+from icalib.optim.state import Key, Layout, State
 from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ratio, times
@@ -175,19 +176,17 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause
     parameter that changes."""
     for assessment in assessments(assessed):
         yield from assessment.clock_causes
-    causes, timeline = list[Cause](), assessed.timeline
-    estimate, tried = assessed.estimate, NO_CHANGES
-    if assessed.segments is not None:
-        tried = changes(estimate.problem, estimate.outcome.state, assessed.inputs.sensors)
+    tried = NO_CHANGES
+    if assessed.segments is not None:  # beside effects, which also differ between segments
+        tried = changes(*assessed.beside, assessed.inputs.sensors)
     if effects := list(effect_causes(assessed, tried)):  # the others may follow from these
         yield from effects
         return
-    if misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
-        causes.append(Cause(_hit_words(hit, timeline), hit.gain, misfit.is_grave))
-    if tried.clear is not None:
-        causes += _change(tried, estimate, misfit, timeline)
-    # the best one only: a change also enlarges residuals at one time, like a disturbance
-    yield from ranked(causes)[:1]
+    change = None if tried.clear is None else next(_change(tried, assessed, misfit), None)
+    if change is not None:  # it also enlarges residuals at one time, like a disturbance
+        yield change
+    elif misfit.fits and (hit := disturbance(assessed.estimate, misfit.chi2, misfit.sensors)) is not None:
+        yield Cause(_hit_words(hit, assessed.timeline), hit.gain, misfit.is_grave)
 
 
 LIKELY = 10.0  # times its usual size: a larger effect, of 500 ppm, is named only, as something else may look like it
@@ -217,33 +216,33 @@ def effect_causes(assessed: AssessedEstimate, tried: Changes) -> Iterator[Cause]
             yield Cause(Remark("clock_drifts", sentence), e.gain, grave, remedy=remedy)
 
 
-def _change(tried: Changes, estimate: Estimate, misfit: Misfit, timeline: Timeline) -> Iterator[Cause]:
+def _change(tried: Changes, assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause]:
     """The clear change. Two that explain as much are named together if they are the same change, seen from either
     sensor, or changes of one sensor. A clock that drifts is an effect, and none of these."""
     best = tried.by_gain[0]
     alike = [c for c in tried.by_gain if c.gain > ALIKE * best.gain]
     kinds_of_best = {(c.name, c.pattern) for c in alike if c.sensors == best.sensors}
     if best.pattern != "pulse" and not best.is_clock_drift and all((c.name, c.pattern) in kinds_of_best for c in alike):
-        words = _change_words(alike, estimate, timeline)
+        words = _change_words(alike, assessed)
         share = min(best.gain / tried.scatter.beyond_chance, 1.0)
         words = words.with_sentence(f"{words} This explains {share:.0%} of what varies over the recording.")
-        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, estimate))
+        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, assessed.beside[0]))
 
 
-def _is_large(c: Change, estimate: Estimate) -> bool:
+def _is_large(c: Change, problem: Problem) -> bool:
     """Whether a parameter changes by more than LARGE tolerances."""
-    tolerance = estimate.problem.tolerance[estimate.problem.layout.columns(c.sensors[0], c.name)]
+    tolerance = problem.tolerance[problem.layout.columns(c.sensors[0], c.name)]
     return bool((np.abs(c.value[: len(tolerance)]) > LARGE * tolerance).any())
 
 
-def _change_words(alike: list[Change], estimate: Estimate, timeline: Timeline) -> Remark:
+def _change_words(alike: list[Change], assessed: AssessedEstimate) -> Remark:
     """A sentence on a change. alike: changes that explain about as much, the best first."""
-    best = alike[0]
+    best, timeline = alike[0], assessed.timeline
     others = list(dict.fromkeys(" and ".join(c.sensors) for c in alike if c.sensors != best.sensors))
     when = "over the recording" if best.pattern == "drift" else f"near {timeline.words(best.second)}"
     if best.name == TIME_OFFSET.name:
         return _clock_words(best, others, when, timeline)
-    changed = [_changed(c, estimate) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
+    changed = [_changed(c, *assessed.beside) for c in alike if c.sensors == best.sensors and c.name != TIME_OFFSET.name]
     what = " or ".join(size for size, _ in changed)
     advice = " ".join(dict.fromkeys(against for _, against in changed))
     instead = f" (or {', or '.join(others)} the opposite way)" if others else ""
@@ -257,17 +256,17 @@ def _names(c: Change) -> str:
     return " and ".join(c.sensors)
 
 
-def _changed(c: Change, estimate: Estimate) -> tuple[Remark, str]:
+def _changed(c: Change, problem: Problem, state: State) -> tuple[Remark, str]:
     """Texts with the size of a change of a lens, of wheels or of extrinsics, and what to do against it."""
     if c.name == "intrinsics":
         size = Remark("lens_changes", f"its lens by up to {np.abs(c.value).max():.2g} px")
         return size, "Switch off autofocus, zoom and image stabilisation."
     if c.name not in ("rotation", "translation"):
-        value = estimate.outcome.state.values[c.sensors[0], c.name]
+        value = state.values[c.sensors[0], c.name]
         sentence = f"its {c.name.replace('_', ' ')} by up to {100.0 * np.abs(c.value / value).max():.2g} %"
         size = Remark("wheel_sizes_change", sentence)
         return size, "Check tyres, load and encoders."
-    turn, move = _sizes(estimate, c)
+    turn, move = _sizes(problem.layout, c)
     return Remark(
         "mount_moves", f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
     ), "Fasten all mounts."
@@ -297,10 +296,9 @@ def _apart(c: Change, timeline: Timeline, words: str) -> str:
     return f"{words} (--to or --from; stay clear of the change near {c.second:.1f} s)"
 
 
-def _sizes(estimate: Estimate, c: Change) -> tuple[float, float]:
+def _sizes(layout: Layout, c: Change) -> tuple[float, float]:
     """Angle [rad] and distance [m] of a change of rotation, translation or both."""
-    layout, n = estimate.problem.layout, 0
-    sizes = {"rotation": 0.0, "translation": 0.0}
+    n, sizes = 0, {"rotation": 0.0, "translation": 0.0}
     for name in sizes:
         if layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
             sizes[name], n = float(np.linalg.norm(c.value[n : n + 3])), n + 3
