@@ -71,8 +71,8 @@ SET_BACK_NS = 1_000_000_000  # a clock that goes back by more was set, and what 
 class CoarseProblem:
     """What a solve needs. parts: of the last minutes, without images; corners: of the searched images of each camera.
 
-    density: recorded images over those that were searched. share: recorded time of `parts` over that of the whole
-    recording, which lasts `seconds`.
+    density: recorded images of the last minutes over those that were searched. share: recorded time of `parts` over
+    that of the whole recording, which lasts `seconds`.
     """
 
     rig: Rig
@@ -453,6 +453,7 @@ class Follower:
         """The problem of the last minutes; None while there is too little."""
         if self.target is None or not self._kept or (rig := self.rig()) is None:
             return None
+        share = min(sum(k.seconds for k in self._kept) / max(self.seconds, 1e-9), 1.0)
         corners, density = [], [1.0]
         for camera in rig.cameras:
             arrivals = self.topics[self.sensors[camera.name].name]
@@ -463,13 +464,12 @@ class Follower:
             stamps, views = zip(*images, strict=True)
             views, _ = without_rare_tags(self.target, number_continuously(self.target, views))
             corners.append(corner_stream(camera.name, np.array(stamps), views))
-            density.append(arrivals.topic.count / max(arrivals.searched, 1))
+            density.append(arrivals.topic.count * share / len(stamps))
         rig = rig.without(*(s.name for s in rig.lidars))
         if not corners and not any(self.sensors[c.name].kind == "corners" for c in rig.cameras):
             return None
-        seconds = sum(k.seconds for k in self._kept)
-        parts, share = tuple(k.part for k in self._kept), seconds / max(self.seconds, 1e-9)
-        return CoarseProblem(rig, parts, tuple(corners), max(density), min(share, 1.0), self.seconds)
+        parts = tuple(kept.part for kept in self._kept)
+        return CoarseProblem(rig, parts, tuple(corners), max(density), share, self.seconds)
 
 
 # What is shown: tables, coverage of the images, and advice.
