@@ -337,7 +337,7 @@ def _linearised(
     Priors on `effects` are so wide that they have no weight."""
     fixed_directions = _in_layout(inputs.layout, estimate.problem.layout, estimate.problem.fixed_directions)
     state = begun(inputs, estimate.outcome.state)
-    zeros = {b.key: np.zeros(b.size) for b in inputs.layout.free if b.kind == "nuisance"}
+    zeros = {b.key: np.zeros(b.size) for b in inputs.layout.free if b.key not in state.values}
     state = replace(state, values=zeros | state.values)
     try:
         problem = estimate.measurement_model.problem(inputs, state, fixed_directions)
@@ -462,8 +462,9 @@ class EffectsLeftOut(NamedTuple):
 def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     """All effects that the rig file does not mention, and IMU intrinsics that it fixes without a value, tested
     together; none without convergence."""
-    specs = _testable(inputs) if estimate.outcome.converged else {}
-    freed = _with_effects(inputs, specs)
+    equipped = _of_rig(inputs, inputs.rig.with_sensors(*(s.with_effects() for s in inputs.rig.sensors.values())))
+    specs = _testable(equipped) if estimate.outcome.converged else {}
+    freed = _with_effects(equipped, specs)
     specs = {key: spec for key, spec in specs.items() if freed.layout.has(*key) and freed.layout.is_free(*key)}
     single = [key for key, spec in specs.items() if spec.size == 1]
     if not specs or (linearised := _linearised(freed, estimate, single)) is None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 from icalib.base.yaml_nodes import YamlValue
 from icalib.sensors.parameter import AXES, Parameter, ParameterSpec, check_sizes
@@ -144,6 +144,10 @@ class Sensor:
     def specs(self) -> tuple[ParameterSpec, ...]:
         """The parameters that this sensor has, in the order of the layout."""
         return self.parameters
+
+    def with_effects(self) -> Self:
+        """This sensor with the effects that its `specs` have only on demand, each fixed at zero."""
+        return self
 
     def spec(self, name: str) -> ParameterSpec:
         """The definition of the parameter group `name` for this sensor."""

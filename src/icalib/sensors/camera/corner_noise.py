@@ -97,11 +97,11 @@ def image_flow(factor: CornerFactor, state: State) -> np.ndarray:
     """(N, 2) px/s: image velocity of each corner."""
     flow = np.empty_like(factor.stream.uv)
     for v0, v1 in factor.blocks():
-        flow[factor.corners_of(v0, v1)] = flow_of_views(factor, state, v0, v1)
+        flow[factor.corners_of(v0, v1)] = _flow_of_views(factor, state, v0, v1)
     return flow
 
 
-def flow_of_views(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
+def _flow_of_views(factor: CornerFactor, state: State, v0: int, v1: int) -> np.ndarray:
     """(n, 2) px/s: image velocity of each corner of views v0..v1."""
     X, _ = factor.points_in_camera(state, v0, v1)
     image = factor.views.image[v0:v1]

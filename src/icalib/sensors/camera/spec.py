@@ -72,6 +72,7 @@ READOUT = ParameterSpec(
     labels=("readout",),
     tolerance="time_tolerance_s",
     prior_sigma=0.02,
+    is_effect=True,
     starts_at_zero=True,
     motion="turn the rig faster, with points in all rows of the image",
 )
@@ -139,6 +140,10 @@ class Camera(MountedSensor):
             prior_sigma=scale * DISTORTION.prior_sigma,
         )
         return (*MOUNTED, CLOCK_RATE, INTRINSICS, distortion, BLOOM, *((READOUT,) if self.rolling else ()))
+
+    def with_effects(self) -> Camera:
+        """See `Sensor`: a rolling shutter."""
+        return self if self.rolling else replace(self, rolling="rows", readout=Parameter("fixed"))
 
     @property
     def shutter(self) -> Shutter | None:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
-from typing import NamedTuple, get_args
 
 import numpy as np
 
@@ -19,14 +19,14 @@ from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.optim.state import State
 from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Timeline
-from icalib.result.quantities import FAR_BEYOND, excess, is_small, ratio, times
+from icalib.result.quantities import excess, is_small, ratio, times
 from icalib.rig import Camera, Rig
 from icalib.sensors.camera.assess.lenses import ambiguities, is_far_guess, wrong_lenses, wrong_models, wrong_resolutions
 from icalib.sensors.camera.corner_bias import centre_shifts
-from icalib.sensors.camera.corner_factor import CornerFactor, CornerOutput
-from icalib.sensors.camera.corner_noise import NoiseModel, flow_of_views
+from icalib.sensors.camera.corner_factor import CornerFactor
+from icalib.sensors.camera.corner_noise import NoiseModel
 from icalib.sensors.camera.model import CameraNoise, words_on_left_out
-from icalib.sensors.camera.spec import BLOOM, INTRINSICS, LENS, Rolling
+from icalib.sensors.camera.spec import BLOOM, INTRINSICS, LENS, READOUT
 from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
 from icalib.sensors.camera.track_factor import FeatureFactor
 from icalib.sensors.camera.track_surfaces import ON_PLANES
@@ -57,7 +57,7 @@ def causes(a: AssessedEstimate) -> Iterator[Cause]:
     inputs, estimate = a.inputs, a.estimate
     yield from swapped_cameras(inputs.rig.cameras, a.groups)
     yield from wrong_resolutions(inputs, estimate, a.groups)
-    yield from rolling_shutters(inputs, estimate, a.misfit_factor >= FAR_BEYOND)
+    yield from rolling_shutters(a)
     yield from wrong_lenses(inputs, a.relaxed_rig, a.factor)
     yield from wrong_models(inputs, estimate)
 
@@ -192,11 +192,8 @@ def misfit(camera: Camera, f: SensorFit, is_noise: bool) -> Remark | None:
 
 
 # Cameras whose rows are exposed one after the other, or that are modelled as simultaneous but are not exposed together:
-# their residuals follow the image speed.
+# residuals of the latter follow the image speed.
 
-# Least share of the squared residuals that a rolling shutter explains. With the global shutters of EuRoC and of
-# simulations it is below 1e-4; 2 ms from the first to the last row explain 0.08.
-ROLLING_SHARE = 0.03
 FASTEST_GAP_S = 1.0  # s between images; over more, their difference does not show the image speed
 FOLLOWS_SPEED = 0.25  # least share of the squared residuals that the lag explains, in each of both cameras
 
@@ -208,82 +205,22 @@ def clock_causes(inputs: Inputs, estimate: Estimate) -> Iterator[Cause]:
         yield Cause(_words(lag), lag.gain, True)
 
 
-def rolling_shutters(inputs: Inputs, estimate: Estimate, is_grave: bool) -> Iterator[Cause]:
+def rolling_shutters(a: AssessedEstimate) -> Iterator[Cause]:
     """A cause for each camera with a rolling shutter, which also explains why fixed lenses contradict the data."""
-    lenses = tuple((camera.name, group) for camera in inputs.rig.cameras for group in LENS)
-    for shutter in _rolling_shutters(inputs, estimate):
-        yield Cause(_shutter_words(shutter), shutter.gain, is_grave, lenses, _estimated(shutter))
+    lenses = tuple((camera.name, group) for camera in a.inputs.rig.cameras for group in LENS)
+    for e in a.effects:
+        if e.spec is READOUT and e.differs:
+            size = f"{1e3 * abs(e.value[0]):.3g} +- {1e3 * e.std[0]:.1g} ms"
+            known = f"{e.sensor} has a rolling shutter, whose rows are exposed over {size}"
+            note = f"{known}, and its readout time was estimated, too; write shutter: {{rolling: rows}}."
+            remedy = Remedy(partial(_with_rows, name=e.sensor), Remark("rolling_shutter_estimated", note))
+            sentence = Remark("rolling_shutter", f"{known}. Write shutter: {{rolling: rows}}.")
+            yield Cause(sentence, e.gain, e.moves > 1.0, lenses, remedy)
 
 
-def _estimated(s: _Shutter) -> Remedy:
-    """The readout time of a rolling shutter as a parameter."""
-    sentence = (
-        f"{s.camera} has a rolling shutter, and its readout time was estimated, too; write shutter: {{rolling: "
-        f"{s.rolling}}}."
-    )
-    return Remedy(
-        lambda rig: rig.with_sensors(replace(rig.sensors[s.camera], rolling=s.rolling)),
-        Remark("rolling_shutter_estimated", sentence),
-    )
-
-
-class _Shutter(NamedTuple):
-    """Time [s] from the first to the last of the rows or columns (`rolling`) of a camera, according to residuals that
-    follow row times image velocity. share: of the squared residuals that it explains; gain: decrease of chi^2."""
-
-    camera: str
-    rolling: Rolling
-    seconds: float
-    share: float
-    gain: float
-
-
-def _rolling_shutters(inputs: Inputs, estimate: Estimate) -> list[_Shutter]:
-    """The rolling shutters, the plainest first. The motion follows the rows of such a camera, so that residuals of
-    others beside it show a shutter of the opposite sign, which is not theirs."""
-    cameras = pairs_of(estimate.problem.factors, estimate.outcome.residuals, CornerFactor)
-    moving = [(factor, out) for factor, out in cameras if factor.imu is not None and (out.root > 0.0).any()]
-    along = [
-        [_shutter(factor, out, estimate.outcome.state, inputs.sensor(factor.name), r) for r in get_args(Rolling)]
-        for factor, out in moving
-        if factor.shutter is None
-    ]
-    shutters = [max(both, key=lambda s: s.gain) for both in along]
-    rolling = sorted((s for s in shutters if s.share > ROLLING_SHARE), key=lambda s: -s.gain)
-    return [s for s in rolling if s.seconds * rolling[0].seconds > 0.0]
-
-
-def _shutter(factor: CornerFactor, out: CornerOutput, state: State, camera: Camera, rolling: Rolling) -> _Shutter:
-    """Regression of corner residuals on row times image velocity. It understates the time, because the motion follows
-    some of the effect."""
-    shutter = replace(camera, rolling=rolling).shutter
-    assert shutter is not None
-    square = along = total = 0.0
-    for v0, v1 in factor.blocks():
-        corners = factor.corners_of(v0, v1)
-        used = out.root[corners] > 0.0
-        weight = out.root[corners][used, None].astype(np.float64)
-        row = shutter.phase(factor.stream.uv[corners][used])[:, None]
-        effect = weight * row * flow_of_views(factor, state, v0, v1)[used]
-        residual = weight * out.residual[corners][used]
-        square += float(np.vdot(effect, effect))
-        along += float(np.vdot(effect, residual))
-        total += float(np.vdot(residual, residual))
-    if square == 0.0 or along == 0.0:
-        return _Shutter(factor.name, rolling, 0.0, 0.0, 0.0)
-    gain = along**2 / square
-    # Residuals are predicted minus measured. A late row shows points farther along their motion.
-    return _Shutter(factor.name, rolling, -along / square, gain / total, gain)
-
-
-def _shutter_words(s: _Shutter) -> Remark:
-    """A sentence on a rolling shutter."""
-    return Remark(
-        "rolling_shutter",
-        f"{s.camera} has a rolling shutter. Corner residuals follow {s.rolling[:-1]} times image speed, as if its "
-        f"{s.rolling} were exposed over {1e3 * abs(s.seconds):.2g} ms or more, which explains {s.share:.0%} of their "
-        f"squares. Write shutter: {{rolling: {s.rolling}}}, and its readout time is estimated.",
-    )
+def _with_rows(rig: Rig, name: str) -> Rig:
+    """The rig with a rolling shutter of the camera `name`."""
+    return rig.with_sensors(replace(rig.sensors[name], rolling="rows"))
 
 
 @dataclass(frozen=True)
