@@ -162,8 +162,8 @@ def _patterns(ends: np.ndarray) -> Iterator[tuple[Pattern, float, np.ndarray]]:
     """Kind, time and values (G,) of each pattern over segments that end at `ends` (G + 1,) s."""
     middle, centre = 0.5 * (ends[:-1] + ends[1:]), 0.5 * (ends[0] + ends[-1])
     yield "drift", float(centre), (middle - centre) / (ends[-1] - ends[0])
-    for second in ends[1:-1]:
-        yield "step", float(second), (middle > second).astype(np.float64)
+    for second in np.sort([*ends[1:-1], *middle[1:-1]]):  # within a segment about half of it changes
+        yield "step", float(second), np.heaviside(middle - second, 0.5)
     for k in range(len(middle) - 1):
         yield "pulse", float(ends[k + 1]), np.isin(np.arange(len(middle)), (k, k + 1)).astype(np.float64)
 
