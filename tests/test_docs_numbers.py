@@ -57,5 +57,5 @@ def test_the_table_of_settings_has_the_defaults():
 
 
 def test_the_faq_and_the_tour_agree_on_the_corner_of_the_image():
-    (of_tour,) = re.findall(r"nearly everywhere, and (\d+) px in the top right corner", page("tour.md"))
+    (of_tour,) = re.findall(r"In the top right corner it is (\d+) px", page("tour.md"))
     assert f"shows a corner of the image with {of_tour} px" in page("faq.md")
