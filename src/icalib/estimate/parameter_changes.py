@@ -8,7 +8,7 @@ which the trajectory of the whole recording is eliminated: that it goes on shows
 covariance, and the decrease of chi^2. A pulse, two segments that differ, is no change, but competes with them:
 one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
 the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
-Changes within a segment are not detected."""
+Within a segment half of it is taken to have changed."""
 
 from __future__ import annotations
 
