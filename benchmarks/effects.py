@@ -182,7 +182,7 @@ def rig_of(scenario: Scenario, kind: Kind) -> Rig:
     prior = Parameter("prior", np.zeros(24), class_imperfections(CLASS).sigma)
     assert rig.imu is not None
     return rig.with_(
-        imu=replace(rig.imu, intrinsics=prior) if kind.imu else None,
+        imu=replace(rig.imu, intrinsics=prior, low_pass=Parameter("fixed")) if kind.imu else None,
         target=target,
         poses=tuple(replace(p, scale_sigma=PoseSensor.scale_sigma) for p in rig.poses),
         lidars=tuple(replace(x, range_scale=Parameter("fixed")) for x in rig.lidars),

@@ -340,7 +340,7 @@ CHARUCO = "{type: charuco, squares_x: 7, squares_y: 5, square_size: 0.04, marker
         (
             "corner_noise: 0.2",
             "shutter: {rolling: rows, readout: {guess: 16.5}}",
-            "sensors.cam0.shutter.readout: is in seconds, and at most 0.5 s; correct it.",
+            "sensors.cam0.shutter.readout: is in s, and at most 0.5 s; correct it.",
         ),
         ("corner_noise: 0.2", "shutter: {rolling: rows, readout: 0.01}", "shutter.readout: must be free or a mapping"),
         ("corner_noise: 0.2", "readout: free", "sensors.cam0.readout: there is no such field"),

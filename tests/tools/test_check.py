@@ -117,7 +117,7 @@ def test_a_target_of_another_size_is_the_reason_and_not_a_change(known: Calibrat
     larger = replace(scenario, target=AprilGrid(6, 6, 0.0968, 0.3))
     found = check_measurements(known, simulate(larger, 2).measurements)
     assert found.validity == "cannot say" and found.new is not None and found.reason == found.new.reasons[0]
-    assert "the target is 1.10" in verdict(found)
+    assert "the target is 1.09" in verdict(found)
 
 
 def first(measurements: Measurements, seconds: float) -> Measurements:

@@ -600,12 +600,13 @@ def _estimated_groups(c: Calibration) -> list[ParameterGroup]:
 
 def _printed(c: Calibration) -> str:
     """Words for the range of empirical factors in the printed standard deviations."""
-    factors = [float(g.factor.max()) for g in _estimated_groups(c) if g.factor is not None]
+    factors = [float(x) for g in _estimated_groups(c) if g.factor is not None for x in g.factor]
     if not factors:
         return "none is printed."
     low, high = format_number(min(factors)), format_number(max(factors))
     return (
-        f"the standard deviations printed here are {low if low == high else f'{low} to {high}'} times the formal ones."
+        f"the printed standard deviations of sensors are {low if low == high else f'{low} to {high}'} times the formal "
+        "ones."
     )
 
 

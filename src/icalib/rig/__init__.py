@@ -2,7 +2,16 @@
 
 from icalib.rig.rig import Loss, Rig, Scheme, Settings, by_name
 from icalib.sensors.camera.spec import LENS, TRACK_IMAGES, Camera
-from icalib.sensors.imu.spec import BY_CLASS, AccelUnit, GyroUnit, ImuNoise, ImuSensor, TwoSources, prior_words
+from icalib.sensors.imu.spec import (
+    BY_CLASS,
+    UNFILTERED,
+    AccelUnit,
+    GyroUnit,
+    ImuNoise,
+    ImuSensor,
+    TwoSources,
+    prior_words,
+)
 from icalib.sensors.lidar.spec import Lidar, PointTime
 from icalib.sensors.parameter import Parameter, ParameterSpec
 from icalib.sensors.pose.spec import PoseKind, PoseSensor
@@ -25,6 +34,7 @@ __all__ = [
     "AccelUnit",
     "Axes",
     "BY_CLASS",
+    "UNFILTERED",
     "Camera",
     "DRIVES",
     "Ground",

@@ -24,6 +24,10 @@ def parameter_fields(sensor: type[Sensor]) -> tuple[str, ...]:
 def parameters(fields: dict[str, YamlValue], specs: Iterable[ParameterSpec]) -> dict[str, Any]:
     """Keyword arguments of a sensor: those parameters of `specs`, and clock_restarts, that the rig file has."""
     groups: dict[str, Any] = {spec.name: parameter(fields[spec.name], spec) for spec in specs if spec.name in fields}
+    for spec in specs:
+        value = groups[spec.name].value if spec.name in groups else None
+        if value is not None and np.abs(value).max(initial=0.0) > spec.largest:
+            fields[spec.name].fail(f"is in {spec.unit}, and at most {spec.largest:g} {spec.unit}; correct it.")
     if "clock_restarts" in fields:
         groups["clock_restarts"] = fields["clock_restarts"].boolean()
         if groups["clock_restarts"] and "time_offset" in groups and groups["time_offset"].mode == "fixed":

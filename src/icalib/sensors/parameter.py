@@ -185,8 +185,9 @@ class ParameterSpec:
     plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
     explains it. is_effect: zero of an ideal sensor; where the rig file gives no value, whether it is zero is tested.
     is_considered: all standard deviations then include the response to it, as far as prior and data let it differ from
-    zero. starts_at_zero: needs no guess. by_images: determined by images, not by motion. motion: advice if the data do
-    not determine the group; {axes} stands for the axes about which the rig hardly turned. motion_on_wheels,
+    zero. starts_at_zero: needs no guess. largest: absolute value that the rig file may state, in `unit`; larger ones
+    were meant in another. by_images: determined by images, not by motion. motion: advice if the data do not determine
+    the group; {axes} stands for the axes about which the rig hardly turned. motion_on_wheels,
     motion_without_target and motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing
     connects the instants.
     """
@@ -206,6 +207,7 @@ class ParameterSpec:
     meaning: str = ""
     starts_at_zero: bool = False
     by_images: bool = False
+    largest: float = np.inf
     motion: str = "move the rig more"
     motion_on_wheels: str = ""
     motion_without_target: str = ""

@@ -65,6 +65,7 @@ CLOCK_RATE = ParameterSpec(
     prior_sigma=50.0,
     is_auxiliary=True,
     is_effect=True,
+    largest=1e5,
     meaning="how much more time passes on the clock of the reference",
     motion="record longer",
 )

@@ -27,6 +27,7 @@ from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ra
 from icalib.result.verdict import AUXILIARY
 from icalib.rig import ImuSensor, Rig
 from icalib.sensors.imu.assess import quiet_scatter
+from icalib.sensors.imu.spec import ACCEL_DELAY
 from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET
 from icalib.validation.guesses import (
     absurd_values,
@@ -300,7 +301,7 @@ def _sizes(layout: Layout, c: Change) -> tuple[float, float]:
     """Angle [rad] and distance [m] of a change of rotation, translation or both."""
     n, sizes = 0, {"rotation": 0.0, "translation": 0.0}
     for name in sizes:
-        if layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
+        if layout.has(c.sensors[0], name) and layout.is_free(c.sensors[0], name) and n + 3 <= len(c.value):
             sizes[name], n = float(np.linalg.norm(c.value[n : n + 3])), n + 3
     return sizes["rotation"], sizes["translation"]
 
@@ -403,7 +404,7 @@ def misfit_causes(assessed: AssessedEstimate, misfit: Misfit, explained: bool) -
         return
     inertial = [f for f in misfit.fits if f.kind in INERTIAL]
     if not noise or any(noise_ratio[f.sensor, f.kind] < 0.5 * excess(f) for f in inertial):
-        yield from _unknown(rig, assessed.estimate, misfit)
+        yield from _unknown(assessed, misfit)
     for f in fits:
         if sentence := misfit_words(rig, f, _is_noise(assessed.estimate, f)):
             yield Cause(sentence, max(f.chi2 - f.dof, 0.0), excess(f) >= FAR_BEYOND)
@@ -467,22 +468,27 @@ def noise_words(imu: ImuSensor, scales: Mapping[str, float]) -> Remark:
     return Remark("imu_noise_understated", sentence) if is_small else Remark("imu_noise_overstated", sentence)
 
 
-def _unknown(rig: Rig, estimate: Estimate, misfit: Misfit) -> Iterator[Cause]:
+def _unknown(assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause]:
     """A sentence on residuals of the IMU that are too large without a known cause. None if another sensor's are, too,
     and are white: a wrong noise of that sensor also enlarges those of the IMU."""
     large = any(f.kind in INERTIAL for f in misfit.fits)
-    if large and not any(f.kind not in INERTIAL and _is_noise(estimate, f) for f in misfit.fits):
-        yield Cause(unknown_words(rig, misfit), misfit.chi2, misfit.is_grave)
+    if large and not any(f.kind not in INERTIAL and _is_noise(assessed.estimate, f) for f in misfit.fits):
+        yield Cause(unknown_words(assessed, misfit), misfit.chi2, misfit.is_grave)
 
 
-def unknown_words(rig: Rig, misfit: Misfit) -> Remark:
-    """A sentence that the cause is unknown, with the checks that were made."""
+def unknown_words(assessed: AssessedEstimate, misfit: Misfit) -> Remark:
+    """A sentence that the cause is unknown, with the checks that were made. Without segments those of effects and of
+    changes say nothing."""
+    rig, split = assessed.inputs.rig, assessed.segments is not None
     checks = {
-        "noise of the readings, fixed values and priors": True,
+        "noise of the readings, fixed values and priors of mounted sensors": True,
         "target size": rig.has_target,
-        "camera models, rolling shutters, and lenses that change": bool(rig.cameras),
+        "camera models": bool(rig.cameras),
+        "rolling shutters, and lenses that change": bool(rig.cameras) and split,
         "swapped cameras": len(rig.cameras) > 1,
-        "clocks that drift or jump, mounts that move, disturbances at one time": True,
+        "delays, filters and places in IMUs": any(e.spec.name == ACCEL_DELAY.name for e in assessed.effects) and split,
+        "clocks that drift or jump, mounts that move": split,
+        "disturbances at one time": True,
     }
     return Remark(
         "residuals_unexplained",

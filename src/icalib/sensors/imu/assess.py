@@ -94,21 +94,22 @@ def _intrinsics_words(imu: ImuSensor) -> Remark | None:
 
 
 def causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each effect on the readings of an IMU; without one, for each IMU whose intrinsics are fixed at those
-    of an ideal one, and are others."""
+    """A cause for each effect on the readings of an IMU, and for each IMU whose intrinsics are fixed at those of an
+    ideal one, and are others."""
     effects = [e for e in a.effects if e.differs]
     affected = {e.sensor for e in effects if e.spec in EFFECTS}
     for e in effects:
         if e.spec in EFFECTS:
             yield from _effect_causes(e)
-        elif e.spec is INTRINSICS and e.sensor not in affected:
+        elif e.spec is INTRINSICS:
             k = int(np.argmax(np.abs(e.value / e.std)))
             sentence = (
                 f"the rig file calls {e.sensor} ideal (intrinsics: fixed), and it is not: {INTRINSICS_LABELS[k]} is "
                 f"about {e.value[k]:.2g} +- {e.std[k]:.2g}, and others may differ, too. Remove intrinsics of "
                 f"{e.sensor} in the rig file, so that they are estimated."
             )
-            yield Cause(Remark("imu_not_ideal", sentence), e.gain, e.moves > 1.0)
+            # not grave beside another effect, from which it may follow
+            yield Cause(Remark("imu_not_ideal", sentence), e.gain, e.moves > 1.0 and e.sensor not in affected)
 
 
 def _effect_causes(e: Effect) -> Iterator[Cause]:

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.rig import ImuNoise, ImuSensor
+from icalib.rig import UNFILTERED, ImuNoise, ImuSensor
 from icalib.sensors.imu.stream import ImuStream
 from icalib.tools.simulation.motion import Errors, readings_with_errors
 from icalib.tools.simulation.output import IMU, BagWriter, write_table
@@ -86,7 +86,7 @@ class SimImu(SimSensor):
         return Report(ImuStream(self.name, stamps, readings.gyro, readings.accel), readings)
 
     def rig_entry(self) -> ImuSensor:
-        return ImuSensor(self.name, f"{self.name}/data.csv", self.noise)
+        return ImuSensor(self.name, f"{self.name}/data.csv", self.noise, low_pass=UNFILTERED)
 
     def record(self, stream: ImuStream, offset_ns: int) -> SimRecord:
         """A table, and the readings as messages, received `offset_ns` after their stamps."""

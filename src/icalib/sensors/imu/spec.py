@@ -78,13 +78,25 @@ INTRINSICS_LABELS = (
 N_INTRINSICS = len(INTRINSICS_LABELS)
 INTRINSICS = ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1, is_effect=True)
 SIZE_EFFECT = ParameterSpec(
-    "size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3, is_effect=True
+    "size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3, is_effect=True, largest=1.0
 )
-ACCEL_DELAY = ParameterSpec("accel_delay", 1, "nuisance", "s", ("accel_delay",), 1e-3, 1e-3, is_effect=True)
+ACCEL_DELAY = ParameterSpec(
+    "accel_delay", 1, "nuisance", "s", ("accel_delay",), 1e-3, 1e-3, is_effect=True, largest=0.5
+)
 LOW_PASS = ParameterSpec(
-    "low_pass", 1, "nuisance", "s^2", ("low_pass",), 1e-4, 1e-5, is_effect=True, is_considered=True
+    name="low_pass",
+    size=1,
+    manifold="nuisance",
+    unit="s^2",
+    labels=("low_pass",),
+    tolerance=1e-4,
+    prior_sigma=1e-5,  # a Gaussian filter of 30 Hz
+    is_auxiliary=True,
+    is_effect=True,
+    is_considered=True,
+    meaning="half the variance of the response of the IMU's filter",
 )
-# Effects on the readings, see `motion.imu_data`. None is in the model, and the rig file has no field for LOW_PASS.
+# Effects on the readings, see `motion.imu_data`; none is in the model unless the rig file has it.
 EFFECTS = (SIZE_EFFECT, ACCEL_DELAY, LOW_PASS)
 
 # gyro, gyro_walk, accel, accel_walk in the units of ImuNoise, from:
@@ -158,11 +170,11 @@ class TwoSources:
 AccelUnit = Literal["m/s^2", "g"]
 GyroUnit = Literal["rad/s", "deg/s"]
 IDEAL = Parameter("fixed")  # without an effect
+UNFILTERED = Parameter("fixed", np.zeros(LOW_PASS.size))  # known to have no filter
 BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
-_EFFECTS = (SIZE_EFFECT.name, ACCEL_DELAY.name)
 _MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
 
 
@@ -227,13 +239,15 @@ class ImuSensor(MountedSensor):
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> ImuSensor:
-        fields = value.record(("type",), ("path", "topic", "noise", "intrinsics", *_EFFECTS, *_FIELDS, *TABLE, *_MOUNT))
+        effects = [spec.name for spec in EFFECTS]
+        options = ("path", "topic", "noise", "intrinsics", *effects, *_FIELDS, *TABLE, *_MOUNT)
+        fields = value.record(("type",), options)
         units: dict[str, Any] = {
             field: fields[field].choice("such unit as", get_args(kind))
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups = parameters(fields, (*MOUNTED, SIZE_EFFECT, ACCEL_DELAY))
+        groups = parameters(fields, (*MOUNTED, *EFFECTS))
         if "intrinsics" in fields:
             groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(

@@ -319,6 +319,7 @@ class Follower:
         with suppress(RigError):  # a target whose corners come as a table
             self._detector = None if self.target is None else detector_of(self.target)
         self._kept: deque[Kept] = deque()
+        self._recorded: dict[str, float] = {}  # seconds by sensor
         self._source: Growing | None = None
         self._began = time.monotonic()
 
@@ -356,7 +357,10 @@ class Follower:
                     added[name] = self.topics[topic.name].note(stamps)
         if np.isnan(list(added.values())).any():
             self._kept.clear()
-        seconds = max((s for s in added.values() if s > 0.0), default=0.0)
+        for name, s in added.items():
+            self._recorded[name] = self._recorded.get(name, 0.0) + np.nan_to_num(s)
+        # Sensors may come one after the other: time counts once.
+        seconds = max(max(self._recorded.values(), default=0.0) - self.seconds, 0.0)
         self._feel(recording)
         clouds = {t.name for t in new if t.kind in ("points", "")}
         self._keep(Kept(part.without(clouds), seconds, corners))

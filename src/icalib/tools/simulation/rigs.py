@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 
 from icalib.geometry.targets import NoTarget
-from icalib.rig import BY_CLASS, TRACK_IMAGES, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
+from icalib.rig import BY_CLASS, TRACK_IMAGES, UNFILTERED, Camera, ImuSensor, Parameter, Rig, Sensor, Settings, by_name
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.sensor import Sampling, mounted
 from icalib.tools.simulation.motion import rotation_from_vector
@@ -67,7 +67,7 @@ def rig_for(
     sensors = [_treated(s, true_values(scenario, sims[s.name]), treated, others) for s in plain]
     imu_intrinsics = _parameter(treated["imu_intrinsics"], scenario.imu_intrinsics)
     sampling: Sampling = "interval-mean" if scenario.imu_sampling == "interval-mean" else "instantaneous"
-    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, imu_intrinsics, sampling=sampling)
+    imu = ImuSensor("imu0", "imu0/data.csv", scenario.imu_noise, imu_intrinsics, low_pass=UNFILTERED, sampling=sampling)
     return Rig(
         by_name(imu, *sensors),
         replace(scenario.target, size_sigma=0.0) if scenario.board and scenario.cameras else NoTarget(),
