@@ -26,7 +26,8 @@ SHORT_S, LONG_S = 60.0, 360.0
 # it is kept.
 CORNER_BYTES = 16 + 8 + 8 + 8 + 4 + 8 + 1 + 37
 # Of a keyframe: two blocks of 15 x 15, 15 x 25 with the calibration, preintegration, ten readings, states and steps.
-KEYFRAME_BYTES = 8 * (2 * 225 + 15 * 25 + 225 + 54 + 150 + 200)
+# The score test has 34 columns more, of effects, and a preintegration of its own with derivatives by 38 parameters.
+KEYFRAME_BYTES = 8 * (2 * 225 + 15 * (25 + 34) + 225 + (225 + 9 * 38 + 15) + (225 + 54 + 15) + 150 + 200)
 LEAST, MOST = 0.75, 1.2  # of what is needed: work space and what the allocator holds are much the same in both
 
 
