@@ -210,7 +210,7 @@ def test_what_halves_say_of_each_other(calibration: Calibration, text: str):
     assert held is not None
     assert "the formal standard deviations are too small by a factor of about 3.0." in page.words
     assert "chi^2 is 900 higher" in page.words and "would make that 100 ± 25" in page.words
-    assert "the standard deviations printed here are 2.7 times the formal ones" in page.words
+    assert "the printed standard deviations of sensors are 2.7 times the formal ones" in page.words
     for cell in ("0.9874", "0.9975", "0.2 px", "0.202 px", "+400.0", "+15.5"):
         assert f'<td class="number">{cell}</td>' in text
     factor, allowed, moved = figures_of(page.source)["held-out"]["data"]
