@@ -73,6 +73,11 @@ class Change:
         return self.name == TIME_OFFSET.name and self.pattern == "drift"
 
 
+def least_chi2(m: int) -> float:
+    """The chi^2 of m numbers that is as unlikely as SIGNIFICANT of one."""
+    return float(special.chdtri(m, special.chdtrc(1, SIGNIFICANT)))
+
+
 @dataclass(frozen=True)
 class Scatter:
     """What separate parameters for each pair of segments gain. gain: decrease of chi^2; dof: number of their
@@ -89,9 +94,8 @@ class Scatter:
     def exceeded_by(self, change: Change) -> bool:
         """Whether the change, and its lead over other patterns, is significant beside the scatter that it leaves."""
         rest = max((self.gain - change.gain) / max(self.dof - change.count, 1.0), 1.0)
-        least = float(special.chdtri(max(change.count, 1), special.chdtrc(1, SIGNIFICANT)))
-        leads = change.gain > least * rest and change.gain - change.rival > LEAD * rest
-        return change.count > 0 and leads
+        leads = change.gain - change.rival > LEAD * rest
+        return change.count > 0 and change.gain > least_chi2(change.count) * rest and leads
 
 
 class Changes(NamedTuple):

@@ -20,12 +20,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, with_association, with_groups
+from icalib.estimate.parameter_changes import SIGNIFICANT, least_chi2
 from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma, stated_priors
 from icalib.estimate.residual_statistics import Segments, calibration_columns, noise_variance, spread_variance
 from icalib.estimate.solver import Linearised, Outcome, outcome_of
@@ -402,7 +402,8 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 
 # Effects: parameters that are zero for an ideal sensor, and that the estimate does not have.
 
-EFFECT_SIGMAS = 5.0  # standard deviations from which an effect differs from zero; of several numbers: the same chance
+# standard deviations from which an effect differs from zero; of several numbers: the same chance
+EFFECT_SIGMAS = SIGNIFICANT**0.5
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
@@ -425,12 +426,7 @@ class Effect:
     @property
     def differs(self) -> bool:
         """Whether it differs from zero."""
-        return self.chi2 > _least_chi2(len(self.value))
-
-    @property
-    def is_suspected(self) -> bool:
-        """Whether it differs from zero if nothing but white noise is left."""
-        return self.gain > _least_chi2(len(self.value))
+        return self.chi2 > least_chi2(len(self.value))
 
     @property
     def plain(self) -> dict[str, Any]:
@@ -523,7 +519,7 @@ class _FreedEstimate:
         step, root = self._step_of(np.arange(self.problem.layout.size))
         columns = {key: self.problem.layout.columns(*key) for key in specs}
         gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
-        suspected = any(gain[key] > _least_chi2(len(k)) for key, k in columns.items())
+        suspected = any(gain[key] > least_chi2(len(k)) for key, k in columns.items())
         ratio = self._scatter(step, root, freed) if suspected else np.ones(len(step))
         std = np.sqrt((root**2).sum(axis=1)) * (np.ones(len(step)) if ratio is None else ratio)
         out = []
@@ -588,8 +584,3 @@ class _FreedEstimate:
 def _chi2(step: np.ndarray, root: np.ndarray) -> float:
     """chi^2 of a step (m,) whose covariance has the root (m, n)."""
     return float(((np.linalg.pinv(root) @ step) ** 2).sum())
-
-
-def _least_chi2(m: int) -> float:
-    """The chi^2 of m numbers that is as unlikely as EFFECT_SIGMAS standard deviations of one."""
-    return float(special.chdtri(m, special.chdtrc(1, EFFECT_SIGMAS**2)))

@@ -202,10 +202,14 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
         unit, scale = display_unit(g.unit)
         by_imu = g.std_by.get(f"{c.imu}.intrinsics", np.zeros(len(g.std)))
         for label, verdict, std, part in zip(g.labels, verdicts, g.std.tolist(), by_imu.tolist(), strict=False):
-            name = f"{g.sensor} {g.name if label in (g.name, '') else f'{g.name} {label}'}".replace("_", " ")
             is_most = part**2 > _MOST_BY_IMU * std**2
             size = f"{scale * part:.2g} of {scale * std:.2g} {unit}" if is_most else f"std {scale * std:.2g} {unit}"
-            yield f"{name} ({size.strip()})", verdict, is_most
+            yield f"{component_name(g, label)} ({size.strip()})", verdict, is_most
+
+
+def component_name(g: ParameterGroup, label: str) -> str:
+    """Words for one number of a group, such as "cam0 rotation x"."""
+    return f"{g.sensor} {g.name if label in (g.name, '') else f'{g.name} {label}'}".replace("_", " ")
 
 
 def named_few(names: list[str]) -> str:

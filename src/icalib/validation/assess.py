@@ -49,7 +49,7 @@ from icalib.result import (
 )
 from icalib.result.calibration import Timeline, row_record
 from icalib.result.saving import versions
-from icalib.result.verdict import AUXILIARY, failure_words, named_few
+from icalib.result.verdict import AUXILIARY, component_name, failure_words, named_few
 from icalib.rig import ParameterSpec
 from icalib.rig.file import rig_to_dict
 from icalib.sensors.parameter import display_unit
@@ -384,9 +384,8 @@ def unseen_notes(groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
         unit, scale = display_unit(g.unit)
         for source, part in g.std_by.items() if g.mode != "prior" and g.name not in AUXILIARY else ():
             for k in np.flatnonzero(part**2 > MOST_OF_VARIANCE * g.std**2):
-                value = f"{g.sensor} {g.name} {'' if g.labels[k] == g.name else g.labels[k]}".replace("_", " ").strip()
                 size = f"{scale * part[k]:.2g} of {scale * g.std[k]:.2g} {unit}".strip()
-                named.setdefault(source, []).append(f"{value} ({size})")
+                named.setdefault(source, []).append(f"{component_name(g, g.labels[k])} ({size})")
     for source, values in named.items():
         sensor, name = source.split(".")
         yield Remark(
