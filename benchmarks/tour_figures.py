@@ -50,14 +50,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-    if chromium is None:
-        raise SystemExit("tour_figures.py: no chromium is installed; install one to have the reports drawn.")
+    chromium = installed_browser()
     FIGURES.mkdir(exist_ok=True)
     for figure in FIGURES_OF_THE_PAGE:
         draw(chromium, folder / figure.result / "report.html", figure, FIGURES / f"{figure.name}.png")
     text = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    _save(_shot(chromium, text, SCREEN), FIRST_SCREEN)
+    save(shot(chromium, text, SCREEN), FIRST_SCREEN)
+
+
+def installed_browser() -> str:
+    """Path of chromium."""
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+    if chromium is None:
+        raise SystemExit("no chromium is installed; install one to have the reports drawn.")
+    return chromium
 
 
 def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
@@ -67,23 +73,23 @@ def draw(chromium: str, report: Path, figure: Figure, file: Path) -> None:
         f"<style>body {{ background: #fff; display: block; }} {hidden} {{ display: none !important; }}</style></head>"
     )
     text = report.read_text(encoding="utf-8").replace("</head>", style, 1)
-    image = _shot(chromium, text, (WIDTH, TALLEST))
+    image = shot(chromium, text, (WIDTH, TALLEST))
     rows = np.flatnonzero((np.asarray(image) != 255).any(axis=(1, 2)))
-    _save(image.crop((0, max(int(rows[0]) - 8, 0), WIDTH, min(int(rows[-1]) + 9, TALLEST))), file)
+    save(image.crop((0, max(int(rows[0]) - 8, 0), WIDTH, min(int(rows[-1]) + 9, TALLEST))), file)
 
 
-def _shot(chromium: str, text: str, size: tuple[int, int]) -> Image.Image:
+def shot(chromium: str, text: str, size: tuple[int, int]) -> Image.Image:
     """A page as a window of this size [px] shows it."""
     with tempfile.TemporaryDirectory() as scratch:
-        page, shot = Path(scratch) / "page.html", Path(scratch) / "shot.png"
+        page, image = Path(scratch) / "page.html", Path(scratch) / "image.png"
         page.write_text(text, encoding="utf-8")
-        where = [f"--user-data-dir={scratch}/profile", f"--window-size={size[0]},{size[1]}", f"--screenshot={shot}"]
+        where = [f"--user-data-dir={scratch}/profile", f"--window-size={size[0]},{size[1]}", f"--screenshot={image}"]
         command = [chromium, *FLAGS.split(), *where, page.as_uri()]
         subprocess.run(command, check=True, capture_output=True, timeout=300)
-        return Image.open(shot).convert("RGB")
+        return Image.open(image).convert("RGB")
 
 
-def _save(image: Image.Image, file: Path) -> None:
+def save(image: Image.Image, file: Path) -> None:
     image.quantize(COLOURS).save(file, optimize=True)
     print(f"{file.name}: {file.stat().st_size / 1e3:.0f} kB")
 

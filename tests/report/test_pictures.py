@@ -16,16 +16,17 @@ from icalib.report import report_html
 from icalib.report.pictures import MOST_MARKS, NEAR_TO_FAR, Drawing, figures
 from icalib.result import Calibration
 from icalib.result.calibration import PointsInImage, ReportImage
-from icalib.result.pictures import MOST_POINTS
+from icalib.result.pictures import MOST_EDGE_POINTS, MOST_POINTS
 
 JPEG = cv2.imencode(".jpg", np.tile(np.arange(200, dtype=np.uint8), (128, 1)))[1].tobytes()
 TRIANGLE = np.array([[10.0, 10.0], [90.0, 10.0], [10.0, 90.0], [np.nan, np.nan], [300.0, 200.0], [310.0, 200.0]])
 MOST_OF_POINTS = 24 * MOST_POINTS  # bytes: at most "M1234 5678h0" in each of two drawings
+MOST_OF_EDGES = 64 * MOST_EDGE_POINTS  # twice "M1234.5 5678.9h0" in each
 
 
 def cloud(count: int) -> PointsInImage:
     u, v = np.random.default_rng(2).uniform([1000, 1000], [3000, 2000], (count, 2)).T
-    return PointsInImage(np.stack([u, v], axis=1), np.geomspace(30.0, 2.0, count))
+    return PointsInImage(np.stack([u, v], axis=1), np.geomspace(30.0, 2.0, count), np.arange(count) % 5 == 0)
 
 
 def with_images(c: Calibration, jpeg: bytes = JPEG, count: int = 24) -> Calibration:
@@ -53,6 +54,24 @@ def test_points_are_coloured_by_distance_and_the_outline_has_two_lines(calibrati
     assert before.jpeg and not after.jpeg and before.image == after.image == "shot-1"
 
 
+def test_the_part_with_most_depth_edges_is_enlarged(calibration: Calibration):
+    c = with_images(calibration)
+    edge = np.array([[5.0, 4.0], [300.0, 200.0], [301.0, 210.0], [299.0, 190.0], [700.0, 470.0]])
+    points = replace(cloud(8), uv=np.vstack([edge, edge[:3]]), edge=np.arange(8) < 5)
+    corners, pair = c.pictures
+    _, before, after = figures(replace(c, pictures=(corners, replace(pair, before=cloud(3), after=points))))
+    assert before.window == after.window == (300.0 - 752 / 12, 200.0 - 480 / 12, 752 / 6, 480 / 6)
+    assert paths(after, "edge") == paths(after, "rim") and paths(after, "edge")[0].count("M") == 5
+    found = report_html(replace(c, pictures=(replace(pair, before=None, after=points),)))
+    assert found.count(f'<use href="#{after.name.replace("1", "0")}"/>') == 1
+    assert 'viewBox="237.3 160.0 125.3 80.0"' in found
+    corner = replace(points, uv=np.full((8, 2), 2.0))
+    *_, after = figures(replace(c, pictures=(replace(pair, after=corner),)))
+    assert after.window == (0.0, 0.0, 752 / 6, 480 / 6)
+    *_, after = figures(replace(c, pictures=(replace(pair, after=replace(points, edge=np.zeros(8, bool))),)))
+    assert after.window is None
+
+
 def test_lines_lead_to_where_a_point_is_projected(calibration: Calibration):
     """A residual of +1 px in u is a line to the right; a rejected corner is a cross."""
     c = with_images(calibration)
@@ -75,7 +94,8 @@ def test_the_page_holds_its_images(calibration: Calibration):
     section, _ = found.split("</section>", 1)
     assert "&lt;pose&gt;.jpg" in section
     links = re.findall(r'(?:src|href)="([^"]*)"', section)
-    assert [link.split(",")[0] for link in links] == 2 * ["data:image/jpeg;base64"] + ["#shot-1"]
+    enlarged, jpeg = ["#shot-1-F", "#shot-1-A"], "data:image/jpeg;base64"
+    assert [link.split(",")[0] for link in links] == [jpeg, jpeg, enlarged[0], "#shot-1", enlarged[1]]
     assert "What the sensors saw" not in report_html(calibration)
 
 
@@ -84,7 +104,7 @@ def test_pictures_have_a_bounded_size(calibration: Calibration):
     corners, *points = figures(with_images(calibration, noise, MOST_POINTS))
     in_page = 4 / 3 * MOST_BYTES + 2_000
     assert size_of(corners) < in_page + 100 * MOST_MARKS
-    assert sum(map(size_of, points)) < in_page + MOST_OF_POINTS + 4_000
+    assert sum(map(size_of, points)) < in_page + MOST_OF_POINTS + MOST_OF_EDGES + 4_000
 
 
 @pytest.mark.parametrize(("option", "wanted"), [([], True), (["--no-images"], False)])

@@ -15,7 +15,15 @@ from icalib.data.measurements import CornerStream, LidarStream, Measurements
 from icalib.geometry.targets import target_from_plain
 from icalib.result import Calibration, RecordingSpan
 from icalib.result.path import CubicPath
-from icalib.result.pictures import MOST_POINTS, Mount, cloud_in_image, pictures, target_in_image
+from icalib.result.pictures import (
+    MOST_EDGE_POINTS,
+    MOST_POINTS,
+    Mount,
+    cloud_in_image,
+    depth_edges,
+    pictures,
+    target_in_image,
+)
 
 ORIGIN_NS = 1_700_000_000_000_000_000
 SPAN = RecordingSpan("run", 0.0, 14.95, ORIGIN_NS)
@@ -115,9 +123,30 @@ def test_points_are_thinned_without_steps(moving):
     scan, uv, _ = scanned(moving, 4 * MOST_POINTS)
     at_ns = stamp_ns(CAMERA_AT_S, CAMERA_OFFSET_S)
     points = cloud_in_image(moving, CubicPath.of(moving), "cam0", mounts(moving), scan, at_ns)
-    assert len(points.uv) == MOST_POINTS
-    row = np.array([int(np.argmin(((uv - at) ** 2).sum(axis=1))) for at in points.uv[::4]])
+    assert MOST_POINTS < len(points.uv) <= MOST_POINTS + MOST_EDGE_POINTS  # at random distances, many are edges
+    row = np.array([int(np.argmin(((uv - at) ** 2).sum(axis=1))) for at in points.uv[~points.edge][::4]])
     assert np.bincount(row % 16, minlength=16).min() > 0.5 * len(row) / 16
+
+
+@pytest.mark.parametrize(("rings", "ring_deg"), [(16, 2.0), (150, 0.2)])
+def test_depth_edges_are_the_sides_of_a_box_before_a_wall(rings, ring_deg):
+    """A box of 20 x 12 deg, 2 m away, before a wall in 3 m, on a floor, which is no edge. Rings that are far apart do
+    not show its top."""
+    azimuth, elevation = np.meshgrid(np.deg2rad(0.2 * np.arange(-150, 151)), np.deg2rad(ring_deg * np.arange(rings)))
+    elevation -= np.deg2rad(0.5 * ring_deg * rings + 0.05)
+    beams = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1)
+    beams[..., :2] /= np.cos(azimuth)[..., None]
+    box = (abs(azimuth) < np.deg2rad(10.01)) & (abs(elevation) < np.deg2rad(6.0))
+    floor = 3.0 * np.tan(elevation) < -0.6
+    reach = np.where(box, 2.0, np.where(floor, -0.6 / np.minimum(np.tan(elevation), -1e-3), 3.0))
+    points = beams * reach[..., None]
+    shuffled = np.random.default_rng(3).permutation(points.size // 3)
+    found = np.zeros(points.size // 3, bool)
+    found[shuffled] = depth_edges(points.reshape(-1, 3)[shuffled])
+    sides = box & (abs(azimuth) > np.deg2rad(9.99))
+    if ring_deg < 1.0:
+        sides |= box & (abs(elevation) > np.deg2rad(5.84))
+    np.testing.assert_array_equal(found.reshape(box.shape), sides)
 
 
 def test_the_outline_is_that_of_the_sheet_in_the_pose_that_the_camera_sees(moving):

@@ -24,6 +24,7 @@ NEAR_TO_FAR = (
 SCALE_PERCENTILES = (2.0, 98.0)  # of the distances: ends of the colours, which single points do not stretch
 MARK_SHARE, ARROW_SHARE = 0.006, 0.03  # of the width of the image: half a mark, and the arrow of a usual residual
 USUAL_PERCENTILE = 90.0  # of the residuals, which sets the magnification of the arrows
+ENLARGED = 6.0  # of the part with edges: 0.5 deg is 4 px of 750 of a usual camera
 MOST_MARKS = 400  # measured points in a picture: more hide one another
 
 
@@ -39,7 +40,8 @@ class Line:
 @dataclass(frozen=True)
 class Drawing:
     """An SVG with the caption `words`. size: width and height; texts: place and text; image: HTML id of an image below
-    the lines; jpeg: that image as base64, in the first drawing that has it."""
+    the lines; jpeg: that image as base64, in the first drawing that has it. window: left, top, width and height of the
+    part that is shown enlarged beside it; name: its HTML id, which that needs."""
 
     size: tuple[int, int]
     words: str
@@ -47,6 +49,8 @@ class Drawing:
     texts: list[tuple[float, float, str]] = field(default_factory=list)
     image: str = ""
     jpeg: str = ""
+    window: tuple[float, float, float, float] | None = None
+    name: str = ""
 
 
 def figures(c: Calibration) -> Iterator[Drawing]:
@@ -58,13 +62,25 @@ def figures(c: Calibration) -> Iterator[Drawing]:
             lines, words = _corners(c, picture, size[0])
             yield Drawing(size, f"{_where(picture)}. {words}", lines, [], image, jpeg)
             continue
-        ends = ends_of(picture.after)
+        ends, window = ends_of(picture.after), window_of(picture.after, size)
         outline = Line("outline", _lines(picture.outline))
         for name, points in (("First guess", picture.before), ("As calibrated", picture.after)):
             if points is not None:
                 words = f"{name}. {picture.sensor} in {_where(picture)}; {_scale(points, ends)}"
-                yield Drawing(size, words, [*_dots(points, ends), outline], [], image, jpeg)
+                lines = [*_dots(points, ends), *_edges(points), outline]
+                yield Drawing(size, words, lines, [], image, jpeg, window, f"{image}-{name[0]}")
                 jpeg = ""
+
+
+def window_of(points: PointsInImage, size: tuple[int, int]) -> tuple[float, float, float, float] | None:
+    """The part of an image of this size, 1 / ENLARGED as wide and high, that has most points on depth edges; None
+    without any."""
+    uv, (width, height) = points.uv[points.edge], np.array(size) / ENLARGED
+    if not len(uv):
+        return None
+    within = np.abs(uv[:, None] - uv) < [0.5 * width, 0.5 * height]
+    left, top = uv[int(np.argmax(within.all(axis=2).sum(axis=1)))] - [0.5 * width, 0.5 * height]
+    return float(np.clip(left, 0.0, size[0] - width)), float(np.clip(top, 0.0, size[1] - height)), width, height
 
 
 def _where(picture: ReportImage) -> str:
@@ -93,6 +109,12 @@ def shades(points: PointsInImage, ends: tuple[float, float]) -> np.ndarray:
 def _dots(points: PointsInImage, ends: tuple[float, float]) -> list[Line]:
     """Dots coloured by distance, the farthest first."""
     return _coloured(points.uv, shades(points, ends))
+
+
+def _edges(points: PointsInImage) -> list[Line]:
+    """White dots with a dark rim at points on depth edges."""
+    data = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in points.uv[points.edge])
+    return [Line("rim", data), Line("edge", data)]
 
 
 def _coloured(points: np.ndarray, colour: np.ndarray) -> list[Line]:

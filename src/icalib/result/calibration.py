@@ -126,10 +126,12 @@ class Visited:
 
 @dataclass(frozen=True)
 class PointsInImage:
-    """Points of a LiDAR in an image: uv (n, 2) px, distance (n,) m from the camera."""
+    """Points of a LiDAR in an image: uv (n, 2) px, distance (n,) m from the camera; edge (n,) bool: on depth edges of
+    the cloud, see `depth_edges`."""
 
     uv: np.ndarray
     distance: np.ndarray
+    edge: np.ndarray
 
 
 @dataclass(frozen=True)

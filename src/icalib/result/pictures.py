@@ -8,6 +8,7 @@ from itertools import islice
 from typing import NamedTuple, Protocol, cast
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from icalib.data.measurements import Measurements
 from icalib.geometry import so3
@@ -17,6 +18,9 @@ from icalib.result.calibration import Calibration, PointsInImage, RecordingSpan,
 from icalib.result.path import Clock, CubicPath
 
 MOST_POINTS = 4000  # of a LiDAR in a picture: more hide one another, and each has some ten bytes in the report
+MOST_EDGE_POINTS = 800  # the same of points on depth edges, which are drawn larger
+EDGE_STEP = 0.1  # share of the distance; a plane shows it between beams 0.2 deg apart if it is grazed by 2 deg
+EDGE_NEIGHBOURS, ALIKE = 4, 1.5  # beams on a grid have four at one angle, and the next at 1.41 times that
 LEAST_POINTS = 100  # in the picture of a moving rig: fewer show no edge
 LONGEST_SCAN_S = 0.2  # of usual LiDARs (5 Hz); points of a picture are taken half of it before and after the image
 MOST_DISTANCE = 1e3  # m: farther points are none
@@ -79,8 +83,21 @@ def in_image(c: Calibration, camera: str, points: np.ndarray) -> tuple[np.ndarra
 def cloud_in_image(
     c: Calibration, path: CubicPath, camera: str, mounts: tuple[Mount, Mount], scans: ScanPoints, stamp_ns: int
 ) -> PointsInImage:
-    """Points of a LiDAR in the image of `camera` with this stamp, the farthest first; at most MOST_POINTS. mounts: of
-    the camera and of the LiDAR.
+    """Points of a LiDAR in the image of `camera` with this stamp, the farthest first; MOST_POINTS, and as many on depth
+    edges, at most. mounts: of the camera and of the LiDAR."""
+    uv, distance, beams = _points_in_image(c, path, camera, mounts, scans, stamp_ns)
+    edge = depth_edges(beams)
+    on_edges = np.flatnonzero(edge)
+    some = np.union1d(_spread(len(uv), MOST_POINTS), on_edges[_spread(len(on_edges), MOST_EDGE_POINTS)])
+    some = some[np.argsort(-distance[some])]
+    return PointsInImage(uv[some], distance[some], edge[some])
+
+
+def _points_in_image(
+    c: Calibration, path: CubicPath, camera: str, mounts: tuple[Mount, Mount], scans: ScanPoints, stamp_ns: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of all points of a LiDAR in an image, their distances (n,) from the camera, and the points (n, 3)
+    as measured, in the LiDAR's frame.
 
     They are the points up to half a scan before and after the image. The trajectory moves each from its own instant to
     that of the image."""
@@ -93,15 +110,27 @@ def cloud_in_image(
     seconds = np.repeat(starts[first:last], np.diff(scans.start[first : last + 1])) + scans.offset_s[rows]
     near = np.abs(seconds - second) <= half
     R, p, known = path.at(seconds[near])
-    on_body = scans.xyz[rows][near].astype(np.float64) @ at_lidar.T[:3, :3].T + at_lidar.T[:3, 3]
+    beams = scans.xyz[rows][near].astype(np.float64)
+    on_body = beams @ at_lidar.T[:3, :3].T + at_lidar.T[:3, 3]
     world = np.einsum("nij,nj->ni", R, on_body) + p
     points = in_camera(path, world[known], at_camera, second)
     uv, inside = in_image(c, camera, points)
     distance = np.linalg.norm(points, axis=1)
     visible = np.flatnonzero(inside & (distance < MOST_DISTANCE))
-    visible = visible[_spread(len(visible), MOST_POINTS)]
-    visible = visible[np.argsort(-distance[visible])]
-    return PointsInImage(uv[visible], distance[visible])
+    return uv[visible], distance[visible], beams[known][visible]
+
+
+def depth_edges(beams: np.ndarray) -> np.ndarray:
+    """(n,) bool: points (n, 3) of a LiDAR, in its frame, beside which it sees something farther by EDGE_STEP of the
+    distance, as Levinson and Thrun (2013) find edges along a ring. Beside are the next beams, up to four, at angles
+    alike: of sparse rings those of the same ring."""
+    if len(beams) <= EDGE_NEIGHBOURS:
+        return np.zeros(len(beams), bool)
+    reach = np.linalg.norm(beams, axis=1)
+    aim = beams / reach[:, None]
+    apart, at = map(np.asarray, KDTree(aim).query(aim, EDGE_NEIGHBOURS + 1))
+    beside = apart[:, 1:] <= ALIKE * apart[:, 1:2]
+    return (beside & (reach[at[:, 1:]] > (1.0 + EDGE_STEP) * reach[:, None])).any(axis=1)
 
 
 def _spread(count: int, most: int) -> np.ndarray:
