@@ -16,7 +16,6 @@ from icalib.data.bag_recording import BagRecording, MessagePart
 from icalib.data.folder import FilePart
 from icalib.data.recording import Growing, NewPart
 from icalib.data.recordings import open_growing_recording, open_recording
-from icalib.errors import RecordingError
 from icalib.tools.simulation.output import IMAGE, IMU, BagForm, BagWriter
 
 COUNT = 400
@@ -137,11 +136,12 @@ def test_files_that_a_recorder_adds_are_read(tmp_path: Path):
     assert len(stamps(parts_of(source), "/imu0")) == COUNT
 
 
-def test_no_bag_is_refused(tmp_path: Path):
+def test_no_bag_is_named(tmp_path: Path):
     path = tmp_path / "notes.txt"
     path.write_text("these are notes on a recording, and no recording at all, as anybody can see here")
-    with pytest.raises(RecordingError, match=r"notes.txt is no bag that can be followed; give a .bag, .mcap or .db3"):
-        not_none(open_growing_recording(path)).part()
+    source = not_none(open_growing_recording(path))
+    sentence = f"{path} is no bag that can be followed; give a .bag, .mcap or .db3 file, or a folder."
+    assert source.part() is None and source.unread == {path: sentence}
 
 
 def lines(header: str, first: int, count: int) -> str:

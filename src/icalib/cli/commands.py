@@ -371,8 +371,13 @@ def _follow(options: argparse.Namespace) -> None:
     if not options.follow:
         raise CalibrationError("--serve shows a recording that is being written; give --follow as well.")
     if options.rig or options.json or options.html or (options.start_s, options.end_s) != (0.0, inf):
-        raise CalibrationError("--follow takes --target and --serve only; inspect the recording once it is complete.")
+        raise CalibrationError(
+            "--follow takes --target, --serve, --quiet only; inspect the recording once it is complete."
+        )
+    if options.quiet and not options.serve:
+        raise CalibrationError("--follow with --quiet shows nothing; leave --quiet out, or give --serve, too.")
     from icalib.tools.inspection import read_target
     from icalib.tools.inspection.follow import follow
 
-    follow(options.recording, read_target(options.target) if options.target else None, options.serve)
+    given = read_target(options.target) if options.target else None
+    follow(options.recording, given, options.serve, options.quiet)

@@ -335,19 +335,6 @@ def open_storage(path: Path, name: Path | None = None) -> Storage:
     )
 
 
-def open_growing(path: Path) -> McapStorage | Ros1Storage | SqliteStorage | None:
-    """Reader of the bag file `path`, which is being written; None while its first bytes are not there. Raises
-    RecordingError if it is no bag, OSError if it cannot be read."""
-    with path.open("rb") as file:
-        head = file.read(HEAD_BYTES)
-    for magic, reader in _READERS.items():
-        if head.startswith(magic):
-            return reader(path, path, growing=True)
-    if len(head) < HEAD_BYTES:
-        return None
-    raise RecordingError(f"{path} is no bag that can be followed; give a .bag, .mcap or .db3 file, or a folder.")
-
-
 def _open_compressed(path: Path) -> Storage:
     """Reader of a file that ROS 2 compressed as a whole. It reads a temporary copy, deleted with the reader."""
     zstd = load_zstd()
@@ -424,6 +411,7 @@ class GrowingBag:
     """A bag file that is being written, or a folder to which bag files are added."""
 
     def __init__(self, root: Path) -> None:
+        self.unread: dict[Path, str] = {}
         self._root = root
         self._storages: dict[Path, McapStorage | Ros1Storage | SqliteStorage] = {}
         self._keys: dict[Connection, int] = {}  # numbers of connections in all files
@@ -447,9 +435,23 @@ class GrowingBag:
 
     def _new_rows(self) -> Iterator[tuple[int, int, bytes]]:
         """Messages of all files since the last look. Copies that the recorder compressed as a whole are left out."""
-        for path in bag_files(self._root) if self._root.is_dir() else [self._root]:
-            if path.suffix != ".zstd" and path not in self._storages and (opened := open_growing(path)) is not None:
+        files = [p for p in bag_files(self._root) if p.suffix != ".zstd"] if self._root.is_dir() else [self._root]
+        for path in files:
+            if path not in self._storages and (opened := self._opened(path)) is not None:
                 self._storages[path] = opened
             if (storage := self._storages.get(path)) is not None:
                 for key, received_ns, content in storage.grown():
                     yield self._keys.setdefault(storage.connections[key], len(self._keys)), received_ns, content
+
+    def _opened(self, path: Path) -> McapStorage | Ros1Storage | SqliteStorage | None:
+        """Reader of a bag file; None while its first bytes are not there, or if they are not those of a bag."""
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+        self.unread.pop(path, None)
+        for magic, reader in _READERS.items():
+            if head.startswith(magic):
+                return reader(path, path, growing=True)
+        if not any(magic.startswith(head) for magic in _READERS):
+            sentence = f"{path} is no bag that can be followed; give a .bag, .mcap or .db3 file, or a folder."
+            self.unread[path] = sentence
+        return None

@@ -445,6 +445,7 @@ class GrowingFolder:
     """A folder to which images, named by stamps in ns, and rows of tables are added."""
 
     def __init__(self, root: Path) -> None:
+        self.unread: dict[Path, str] = {}
         self._root = root
         self._tables: dict[str, tuple[bytes, int]] = {}  # header, and number of bytes that were read
         self._newest: dict[Path, int] = {}  # stamp of the newest image that was read, by folder
@@ -453,8 +454,12 @@ class GrowingFolder:
         """See `Growing`."""
         images, tables = self._new_images(), {}
         filmed = {folder.parent for folder in self._newest}
-        for path in sorted(p for pattern in ("*.csv", "*/*.csv", "mav0/*/*.csv") for p in self._root.glob(pattern)):
-            if not (path.name in _OF_IMAGES and path.parent in filmed) and (rows := self._new_rows(path)):
+        for path in sorted(p for pattern in ("*.csv*", "*/*.csv*", "mav0/*/*.csv*") for p in self._root.glob(pattern)):
+            if path.name in _OF_IMAGES and path.parent in filmed:
+                continue
+            if path.suffix == ".gz":
+                self.unread[path] = f"{path} is compressed and cannot be followed; let it be written as {path.stem}."
+            elif path.suffix == ".csv" and (rows := self._new_rows(path)):
                 name = str(path.relative_to(self._root))
                 tables[name] = self._tables[name][0], rows
         return FilePart(tables, images) if tables or images else None
@@ -476,7 +481,10 @@ class GrowingFolder:
         """Images since the last look, by path in the folder."""
         images: dict[str, Path] = {}
         for folder in (p for pattern in ("*", "*/data", "mav0/*/data") for p in self._root.glob(pattern) if p.is_dir()):
-            named = ((int(p.stem), p) for p in pictures_in(folder) if p.stem.isdecimal())
+            pictures = pictures_in(folder)
+            named = [(int(p.stem), p) for p in pictures if p.stem.isdecimal()]
+            if len(named) < len(pictures):
+                self.unread[folder] = f"{folder} has images that cannot be followed; name them by their stamps in ns."
             new = sorted(pair for pair in named if pair[0] > self._newest.get(folder, -1))
             while new and time.time() - new[-1][1].stat().st_mtime < _SETTLED_S:
                 new.pop()

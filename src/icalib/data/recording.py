@@ -177,7 +177,12 @@ class NewPart(ABC):
 
 
 class Growing(Protocol):
-    """A recording that is being written. Reading it writes nothing, and locks nothing."""
+    """A recording that is being written. Reading it writes nothing, and locks nothing.
+
+    unread: by file or folder, a sentence on what cannot be followed.
+    """
+
+    unread: dict[Path, str]
 
     def part(self) -> NewPart | None:
         """What is new, up to PART_BYTES; None if nothing is. Raises OSError and RecordingError."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import io
 import os
 import signal
 import subprocess
@@ -15,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from tests.typed import not_none
 
 import icalib
@@ -24,6 +27,7 @@ from icalib.data.measurements import CornerStream
 from icalib.pipeline import calibrate_measurements, measure
 from icalib.rig.file import load_rig
 from icalib.tools.inspection import read_target
+from icalib.tools.inspection.console import Page, screen
 from icalib.tools.inspection.facts import GivenTarget
 from icalib.tools.inspection.follow import (
     Arrivals,
@@ -31,7 +35,6 @@ from icalib.tools.inspection.follow import (
     Expectation,
     ExpectedStd,
     Follower,
-    Page,
     Solver,
     predict,
     view,
@@ -82,7 +85,8 @@ def test_a_bag_is_followed_in_time_with_half_a_core(filmed: Path, target: Path, 
     assert compiled.look()
     path, late = tmp_path / "live.mcap", [0.0]
     follower = Follower(path, given)
-    assert not follower.look() and follower.problem == f"{path} is not there yet; waiting for it."
+    assert not follower.look()
+    assert follower.problem == f"{path} is not there yet; start the recorder, or correct the path."
     begin, processor = time.monotonic(), time.process_time()
     for share in play(filmed, path, SECONDS):
         worked = time.monotonic()
@@ -118,6 +122,8 @@ def test_a_rig_file_names_the_sensors(filmed: Path, tmp_path: Path):
     follower = Follower(filmed, read_target(path))
     while follower.look():
         pass
+    sentence = f"wheels: {filmed} has no joints for wheels; it holds /cam0/image_raw (sensor_msgs/msg/Image), "
+    assert view(follower, None).advice[0].startswith(sentence)
     assert {name: topic.name for name, topic in follower.sensors.items()} == {"imu": "/imu0", "left": "/cam0/image_raw"}
     problem = not_none(follower.coarse_problem())
     assert list(problem.rig.sensors) == ["imu", "left"] and [c.name for c in problem.corners] == ["left"]
@@ -201,16 +207,84 @@ def test_advice_names_the_axis_and_the_place_in_the_image(target: Path):
     )
     done = Expectation(12.0, (expected("rotation", "x", 0.0001, 0.0),), turned)
     assert view(f, done).advice[0] == "All extrinsics and time offsets are determined after 12 s."
-    table = view(f, Expectation(10.0, (weak, late), turned)).tables[2]
+    table = view(f, Expectation(10.0, (weak, late), turned)).tables[1]
     assert table.rows == (
-        ("cam0", "rotation [deg]", "0.115", "0.0573 deg", "30 s more"),
-        ("cam0", "time offset [ms]", "4", "1 ms", "move otherwise"),
+        ("cam0", "rotation", "0.11", "0.057", "deg", "30 s more"),
+        ("cam0", "time offset", "4", "1", "ms", "move otherwise"),
     )
     failed = Expectation(3.0, problem="too short.")
     assert view(f, failed).advice[:2] == (
         "No prediction yet: too short.",
         "imu0 turned least about its z axis so far; turn about it, too.",
     )
+
+
+def readings(first_ns: int) -> str:
+    """A second of readings of an IMU at rest."""
+    return "".join(f"{first_ns + k * 10**7},0.1,0.0,0.0,0.0,0.0,9.81\n" for k in range(100))
+
+
+def test_what_is_not_followed_is_said(target: Path, tmp_path: Path):
+    def first(name: str) -> str:
+        follower = Follower(tmp_path / name, read_target(target))
+        follower.look()
+        return view(follower, None).advice[0].replace(f"{tmp_path}/", "")
+
+    for name, text in (("a.mcap", "some text"), ("b.mcap", "a line of text\n" * 9), ("c.mcap", "")):
+        (tmp_path / name).write_text(text)
+    for name in ("packed/imu0", "named/cam0", "words/imu0", "nothing"):
+        (tmp_path / name).mkdir(parents=True)
+    (tmp_path / "packed/imu0/data.csv.gz").write_bytes(gzip.compress(b"1,2,3"))
+    (tmp_path / "named/cam0/image-1.png").touch()
+    (tmp_path / "words/imu0/data.csv").write_text("never,a,number,in,a,row,here\n" * 2 + "1,x,x,x,x,x,x\n")
+    no_bag = "is no bag that can be followed; give a .bag, .mcap or .db3 file, or a folder."
+    assert (first("a.mcap"), first("b.mcap")) == (f"a.mcap {no_bag}", f"b.mcap {no_bag}")
+    gives = "start the recorder, or give the bag or folder that it writes."
+    assert first("c.mcap") == f"c.mcap has no messages yet; {gives}"
+    assert first("nothing") == f"nothing has no bag, table or images yet; {gives}"
+    packed = "packed/imu0/data.csv.gz is compressed and cannot be followed; let it be written as data.csv."
+    assert first("packed") == packed
+    assert first("named") == "named/cam0 has images that cannot be followed; name them by their stamps in ns."
+    assert first("words").startswith("words/imu0/data.csv")
+
+
+def test_a_bag_beside_a_file_that_is_none_is_followed(filmed: Path, tmp_path: Path):
+    (tmp_path / "a.mcap").write_text("some text")
+    (tmp_path / "b.mcap").symlink_to(filmed)
+    follower = Follower(tmp_path)
+    while follower.look():
+        pass
+    assert follower.topics.keys() >= {"/imu0"} and "a.mcap is no bag" in view(follower, None).advice[0]
+
+
+def test_a_sensor_without_its_table_is_said(tmp_path: Path):
+    (tmp_path / "imu0").mkdir()
+    (tmp_path / "rig.yaml").write_text("sensors:\n  imu: {type: imu, path: imu/data.csv}\n  lidar0: {type: lidar}\n")
+    (tmp_path / "imu0" / "data.csv").write_text("".join(readings(k * 10**9) for k in range(8)))
+    follower = Follower(tmp_path, read_target(tmp_path / "rig.yaml"))
+    assert follower.look() and not follower.sensors
+    there = "it holds imu0/data.csv (table of readings); set `path` in the rig file."
+    assert view(follower, None).advice[0] == f"imu: {tmp_path} has no imu/data.csv; {there}"
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (60, 12), (200, 60)])
+def test_the_view_fits_the_terminal(width: int, height: int, target: Path):
+    f = follower_at(read_target(target), cam0=(50, 50), a_camera_with_a_long_name=(9, 4))
+    for k in range(9):
+        f.topics[f"/robot/other/{k}"] = Arrivals(replace(f.sensors["imu0"], kind=""))
+    stds = [expected("rotation", axis, 0.002, 30.0) for axis in "xyz"]
+    stds += [replace(stds[0], sensor=f"camera{k}", needed_s=0.0) for k in range(9)]
+    now = view(f, Expectation(10.0, tuple(stds), {"cam0": np.eye(3)}))
+    console = Console(width=width, height=height, file=io.StringIO(), record=True)
+    console.print(screen(now, width, height))
+    lines = console.export_text().splitlines()
+    assert len(lines) <= height and max(map(len, lines)) <= width
+    assert lines[0] == "run.mcap, 0 s recorded" and lines[1].startswith("  Turn about the")
+    whole = not lines[-1].startswith("Enlarge the terminal for: ")
+    assert whole == (height == 60)
+    text = "\n".join(lines)
+    assert ("/robot/other/8" in text) == ("camera8" in text) == whole
+    assert ("0.11, 0.11, 0.11" in text) == (height >= 24)
 
 
 def test_a_recorder_that_has_ended_is_said_first(target: Path):
@@ -239,7 +313,7 @@ def test_a_clock_that_is_set_leaves_out_what_was_before(tmp_path: Path):
     follower = Follower(tmp_path)
     for first in (10**9, 10**18, 10**18 + 10**9, 10**12):
         with table.open("a") as file:
-            file.writelines(f"{first + k * 10**7},0.1,0.0,0.0,0.0,0.0,9.81\n" for k in range(100))
+            file.write(readings(first))
         assert follower.look()
         assert len(follower._kept) == (2 if first == 10**18 + 10**9 else 1)
     assert follower.seconds == pytest.approx(0.99 + 1.0, abs=0.02)
@@ -251,7 +325,7 @@ def test_memory_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     follower = Follower(tmp_path)
     for second in range(20):
         with (tmp_path / "imu0" / "data.csv").open("a") as file:
-            file.writelines(f"{second * 10**9 + k * 10**7},0.1,0.0,0.0,0.0,0.0,9.81\n" for k in range(100))
+            file.write(readings(second * 10**9))
         assert follower.look()
     assert len(follower._kept) <= 7 and follower.seconds == pytest.approx(19.99)
 
@@ -291,6 +365,9 @@ def test_the_page_shows_the_view(target: Path):
             urllib.request.urlopen(url + "other", timeout=10)
         with pytest.raises(icalib.CalibrationError, match=r"--serve 127.0.0.1:\d+ cannot be used .* give another port"):
             Page(("127.0.0.1", page.port))
+        for host in ("203.0.113.5", "x" * 70):  # an address of others, and no name
+            with pytest.raises(icalib.CalibrationError, match=rf"--serve {host}:80 .*; give this computer's address"):
+                Page((host, 80))
     finally:
         page.close()
 
@@ -311,7 +388,7 @@ def test_an_interrupt_ends_with_a_line(filmed: Path, target: Path, tmp_path: Pat
     options = ["inspect", str(path), "--follow", "--target", str(target), "--serve", "0"]
     with printed.open("w") as out:
         process = subprocess.Popen([sys.executable, "-uc", program, *options], stdout=out, stderr=out, env=os.environ)
-        said(printed, "is not there yet; waiting for it.")
+        said(printed, "is not there yet; start the recorder")
         path.write_bytes(filmed.read_bytes()[:-50_000])  # a writer that is killed
         said(printed, "imu0 200.0 Hz.")
         process.send_signal(signal.SIGINT)
@@ -324,7 +401,8 @@ def test_an_interrupt_ends_with_a_line(filmed: Path, target: Path, tmp_path: Pat
     ("options", "sentence"),
     [
         (["--serve"], "--serve shows a recording that is being written; give --follow as well."),
-        (["--follow", "--json", "x"], "--follow takes --target and --serve only"),
+        (["--follow", "--json", "x"], "--follow takes --target, --serve, --quiet only"),
+        (["--follow", "--quiet"], "--follow with --quiet shows nothing; leave --quiet out, or give --serve, too."),
     ],
 )
 def test_options_that_do_not_go_together(options: list[str], sentence: str, capsys: pytest.CaptureFixture[str]):

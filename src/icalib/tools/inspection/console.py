@@ -6,8 +6,13 @@ The same as a page with plots and images. Figures of an inspection as plain data
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import textwrap
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from errno import EACCES, EADDRINUSE
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import numpy as np
@@ -18,9 +23,10 @@ from rich.table import Table
 from rich.text import Text
 
 from icalib.base.files import json_text
+from icalib.errors import CalibrationError
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
-from icalib.report.page import document
+from icalib.report.page import document, render
 from icalib.tools.inspection.facts import Inspection, StreamFacts, named, plain
 
 STYLES = {"problem": "bold red", "warning": "yellow", "hint": "dim"}
@@ -232,3 +238,149 @@ def coverage_map(cells: Sequence[Sequence[int]]) -> str:
 
 def _digit(count: int, most: int) -> str:
     return str(max(1, round(9 * count / most))) if count else "."
+
+
+# A recording that is being written: what is shown of it, on a terminal and on a local page.
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A table: title, headers, rows of text, of which the first `main` are more important. rank: smaller for a table
+    that is more important."""
+
+    title: str
+    headers: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    main: int
+    rank: int
+
+
+@dataclass(frozen=True)
+class View:
+    """What is shown at an instant. advice: sentences, the first is the most important; tables: the first has a row for
+    each topic; coverage: title and map of each camera."""
+
+    title: str
+    advice: tuple[str, ...]
+    tables: tuple[Grid, ...]
+    coverage: tuple[tuple[str, str], ...]
+
+    @property
+    def line(self) -> str:
+        """The state in one line."""
+        rows = ((row[0] or row[1], row[2], f" ({row[5]} with target)" if row[5] else "") for row in self.tables[0].rows)
+        sensors = ", ".join(f"{name} {rate}{seen}" for name, rate, seen in rows)
+        return f"{self.title}: {sensors or 'nothing has arrived'}. {self.advice[0] if self.advice else ''}".rstrip()
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Lines for a terminal, of which `least` or more are shown, or none. rank: smaller if it is more important."""
+
+    rank: int
+    name: str
+    lines: Sequence[Text]
+    least: int = 1
+
+
+_ADVICE, _MAPS, _MINOR = 2, 4, 6  # ranks, beside those of the tables
+_MAP_CHARS = 2 * GRID[0] + 4
+
+
+def screen(now: View, width: int, height: int) -> Text:
+    """The view in `height` lines of a terminal. Less important lines are left out, which the last line tells."""
+    width = max(width, 2 * _MAP_CHARS)
+    sentences = [textwrap.wrap(x, width, initial_indent="  ", subsequent_indent="  ") for x in now.advice]
+    blocks = [_Block(0, "", [Text(_shortened(now.title, width), style="bold")])]
+    for k, lines in enumerate(sentences):
+        words = [Text(line, style="yellow" if k == 0 else "") for line in lines]
+        blocks.append(_Block(_ADVICE if k else 0, "Advice", words, len(lines)))
+    for grid in now.tables:
+        lines = list(_table_lines(grid, width))
+        name = grid.title.partition(",")[0]
+        blocks.append(_Block(grid.rank, name, lines[: 2 + grid.main], min(3, len(lines))))
+        blocks.append(_Block(_MINOR, name, lines[2 + grid.main :]))
+    maps = list(_map_lines(now.coverage, width))
+    blocks.append(_Block(_MAPS, "Coverage", maps, min(1 + GRID[1], len(maps))))
+    return Text("\n", no_wrap=True).join(_fitting(blocks, width, height))
+
+
+def _fitting(blocks: Sequence[_Block], width: int, height: int) -> Iterator[Text]:
+    """The lines that fit into a terminal; if some do not, the last one tells it."""
+    taken, left_out = dict[int, int](), list[str]()
+    room = height if sum(len(block.lines) for block in blocks) <= height else height - 1
+    for block in sorted(blocks, key=lambda block: block.rank):
+        n = 0 if block.name in left_out or room < block.least else min(len(block.lines), room)
+        taken[id(block)], room = n, room - n
+        left_out += [block.name] * (n < len(block.lines))
+    for block in blocks:
+        yield from block.lines[: taken[id(block)]]
+    if left_out:
+        names = ", ".join(dict.fromkeys(left_out))
+        yield Text(_shortened(f"Enlarge the terminal for: {names}", width), style="dim")
+
+
+def _table_lines(grid: Grid, width: int) -> Iterator[Text]:
+    """Title, headers and rows, one line each; the widest columns are shortened."""
+    cells = [grid.headers, *grid.rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    while sum(widths) + 2 * len(widths) > width and max(widths) > 1:
+        widths[widths.index(max(widths))] -= 1
+    yield Text(_shortened(grid.title, width), style="bold")
+    for k, row in enumerate(cells):
+        line = "  ".join(_shortened(cell, w).ljust(w) for cell, w in zip(row, widths, strict=True))
+        yield Text(f"  {line}", style="" if k else "dim")
+
+
+def _map_lines(maps: Sequence[tuple[str, str]], width: int) -> Iterator[Text]:
+    """Names and maps of all cameras, side by side as far as the width goes."""
+    beside = width // _MAP_CHARS
+    for k in range(0, len(maps), beside):
+        lines = [[_shortened(name, _MAP_CHARS - 4), *cells.split("\n")] for name, cells in maps[k : k + beside]]
+        for row, line in enumerate(zip(*lines, strict=True)):
+            words = "".join(f"  {cell.strip()}".ljust(_MAP_CHARS) for cell in line)
+            yield Text(words.rstrip(), style="" if row else "dim")
+
+
+def _shortened(text: str, width: int) -> str:
+    """The text with at most `width` characters: its middle is left out."""
+    return text if len(text) <= width else f"{text[: (width - 1) // 2]}\u2026{text[len(text) - width // 2 :]}"
+
+
+class Page:
+    """A local page with the latest view, which refreshes itself. Raises CalibrationError if the address is taken."""
+
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._body = ""
+        page, frame = self, render("tools/inspection/follow.html")
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                content = {"/": frame, "/body": page._body}.get(self.path)
+                self.send_response(404 if content is None else 200)
+                self.send_header("Content-Type", "text/html; charset=utf-8")
+                self.end_headers()
+                self.wfile.write((content or "").encode())
+
+            def log_message(self, format: str, *args: Any) -> None:
+                """Nothing: the terminal shows the recording."""
+
+        try:
+            self._server = ThreadingHTTPServer(address, Handler)
+        except (OSError, UnicodeError) as error:  # UnicodeError: no name of a host
+            is_port = isinstance(error, OSError) and error.errno in (EACCES, EADDRINUSE)
+            advice = "another port, as in --serve 8766" if is_port else "this computer's address, as in --serve 8765"
+            reason = getattr(error, "strerror", None) or "it is no address"
+            raise CalibrationError(
+                f"--serve {address[0]}:{address[1]} cannot be used ({reason}); give {advice}."
+            ) from error
+        self.host, self.port = str(self._server.server_address[0]), int(self._server.server_address[1])
+        Thread(target=self._server.serve_forever, daemon=True).start()
+
+    def show(self, now: View) -> None:
+        """Replaces the content."""
+        self._body = render("tools/inspection/follow_body.html", now=now)
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()

@@ -12,23 +12,21 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, nullcontext, suppress
+from contextlib import closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from itertools import groupby
 from math import inf
 from multiprocessing.connection import Connection
 from pathlib import Path
-from threading import Thread
 from typing import Any
 
 import numpy as np
-from rich.console import Console, Group
+from rich.console import Console
 from rich.live import Live
-from rich.text import Text
 
+from icalib.data.folder import GrowingFolder
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
-from icalib.data.messages import TopicInfo, choose_topic
+from icalib.data.messages import TopicInfo, choose_topic, listing
 from icalib.data.recording import Growing, NewPart
 from icalib.data.recordings import DamagedImageError, Recording, decode, open_growing_recording, read_measurements
 from icalib.data.stamps import LONGEST_S
@@ -39,7 +37,6 @@ from icalib.errors import CalibrationError, RecordingError, RigError
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
 from icalib.pipeline import calibrate_measurements
-from icalib.report.page import render
 from icalib.result import ParameterGroup
 from icalib.rig import ImuSensor, Rig, Sensor
 from icalib.rig.file import load_rig, rig_from_dict
@@ -51,7 +48,7 @@ from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import MOUNTED_NAMES, TIME_OFFSET
 from icalib.tools.batch import sentence_on
 from icalib.tools.inspection import find_sources
-from icalib.tools.inspection.console import GRID, coverage, coverage_map, empty_borders, plain_table
+from icalib.tools.inspection.console import GRID, Grid, Page, View, coverage, coverage_map, empty_borders, screen
 from icalib.tools.inspection.facts import GivenTarget
 
 LOOK_EVERY_S = 0.2
@@ -300,12 +297,23 @@ class Kept:
     corners: Mapping[str, Sequence[tuple[int, ImageCorners]]]
 
 
+@contextmanager
+def _noted(sentences: dict[str, str], name: str, root: Path, instead: Path) -> Iterator[None]:
+    """Keeps the sentence of a RecordingError by `name`, until there is none. `instead` replaces `root` in it."""
+    try:
+        yield
+        sentences.pop(name, None)
+    except RecordingError as error:
+        sentences[name] = str(error).replace(str(root), str(instead))
+
+
 class Follower:
     """Everything that is known of a recording that is being written; `look` reads what is new. given: the target, and
     the rig if its file is a rig file.
 
-    topics: by name; sensors: topic of each sensor, the reference first; problem: a sentence on what cannot be read, ""
-    if nothing; seconds: recorded time so far.
+    topics: by name; sensors: topic of each sensor, the reference first; seconds: recorded time so far. Sentences:
+    problem: on the whole, "" if there is none; missing: on each sensor of the rig file without a topic; unread: on each
+    file or topic that is not read.
     """
 
     def __init__(self, root: Path, given: GivenTarget | None = None) -> None:
@@ -313,6 +321,8 @@ class Follower:
         self.topics: dict[str, Arrivals] = {}
         self.sensors: dict[str, TopicInfo] = {}
         self.motion, self.seconds, self.problem = Motion(), 0.0, ""
+        self.missing: dict[str, str] = {}
+        self.unread: dict[str, str] = {}
         self.target = given.target if given is not None and len(given.target.bodies) else None
         self._stated = load_rig(given.file) if given is not None and given.sensors else None
         self._detector: Detector | None = None
@@ -327,8 +337,10 @@ class Follower:
         """Reads a part of what is new; whether there was any."""
         try:
             self._source = self._source or open_growing_recording(self.root)
-            self.problem = "" if self._source else f"{self.root} is not there yet; waiting for it."
             part = None if self._source is None else self._source.part()
+            files = {} if self._source is None else {str(p): sentence for p, sentence in self._source.unread.items()}
+            self.unread = {name: self.unread[name] for name in self.unread if name in self.topics} | files
+            self.problem = "" if self.topics or part or files else self._nothing()
             if part is not None:
                 with tempfile.TemporaryDirectory(prefix="icalib-") as folder:
                     self._take(part, part.recording(Path(folder)))
@@ -336,6 +348,13 @@ class Follower:
             self.problem = str(error)
             return False
         return part is not None
+
+    def _nothing(self) -> str:
+        """A sentence on a recording of which nothing has arrived."""
+        if not self.root.exists():
+            return f"{self.root} is not there yet; start the recorder, or correct the path."
+        what = "messages" if self.root.is_file() else "bag, table or images"
+        return f"{self.root} has no {what} yet; start the recorder, or give the bag or folder that it writes."
 
     def _take(self, part: NewPart, recording: Recording) -> None:
         """Notes what a part holds, and keeps what a coarse problem needs."""
@@ -349,7 +368,7 @@ class Follower:
         added: dict[str, float] = {}
         corners: dict[str, list[tuple[int, ImageCorners]]] = {}
         for topic in (t for t in new if t.kind):
-            with suppress(RecordingError):  # such as messages without an image
+            with _noted(self.unread, topic.name, recording.root, self.root):
                 name = names.get(topic.name, topic.name)
                 if topic.kind == "image":
                     added[name], corners[name] = self._search(recording, self.topics[topic.name])
@@ -371,19 +390,21 @@ class Follower:
         if self._stated is None:
             named = {name: source.topic for name, source in find_sources(topics).sensors.items()}
         else:
-            pairs = ((name, self._topic_of(s, topics)) for name, s in self._stated.sensors.items())
-            named = {name: topic for name, topic in pairs if topic is not None}
+            named = {}
+            for name, sensor in self._stated.sensors.items():
+                with _noted(self.missing, name, self.root, self.root):
+                    named[name] = self._topic_of(sensor, topics)
         return dict(sorted(named.items(), key=lambda item: item[1].kind != "imu"))
 
-    def _topic_of(self, sensor: Sensor, topics: list[TopicInfo]) -> TopicInfo | None:
-        """The topic of a sensor of the rig file; None while it has none."""
+    def _topic_of(self, sensor: Sensor, topics: list[TopicInfo]) -> TopicInfo:
+        """The topic of a sensor of the rig file. Raises RecordingError while it has none."""
         kinds = inspectors()[sensor.sensor_type].topic_kinds
-        stated = [x for x in (getattr(sensor, "topic", None), getattr(sensor, "path", None)) if isinstance(x, str)]
-        if named := [t for t in topics if t.kind in kinds and t.name.lstrip("/") in {x.lstrip("/") for x in stated}]:
-            return named[0]
-        with suppress(RecordingError):
-            return choose_topic(str(self.root), topics, sensor.name, None, *kinds)
-        return None
+        topic, path = (getattr(sensor, name, None) for name in ("topic", "path"))
+        if tables := [t for t in topics if t.name == path and t.kind in kinds]:
+            return tables[0]
+        if isinstance(path, str) and "image" not in kinds and isinstance(self._source, GrowingFolder):
+            raise RecordingError(f"{self.root} has no {path}; {listing(topics)}; set `path` in the rig file.")
+        return choose_topic(str(self.root), topics, sensor.name, topic, *(("image",) if "image" in kinds else kinds))
 
     def _search(self, recording: Recording, camera: Arrivals) -> tuple[float, list[tuple[int, ImageCorners]]]:
         """Notes the images of a camera. Returns the recorded time [s] that they add, and stamps and corners of those
@@ -426,7 +447,7 @@ class Follower:
             return
         unstated = ImuSensor(name, topic.name, class_noise(DEFAULT_CLASS), topic=topic.name)
         sensor = self._stated.sensors[name] if self._stated else unstated
-        with suppress(RecordingError):
+        with _noted(self.unread, topic.name, recording.root, self.root):
             if isinstance(sensor, ImuSensor) and isinstance(imu := imu_readings(recording, sensor), ImuStream):
                 self.motion.add(in_si(imu, sensor), self.topics[topic.name].rate_hz)
 
@@ -479,42 +500,15 @@ class Follower:
 # What is shown: tables, coverage of the images, and advice.
 
 
-@dataclass(frozen=True)
-class Grid:
-    """A table: title, headers, rows of text."""
-
-    title: str
-    headers: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
-class View:
-    """What is shown at an instant. coverage: title and map of each camera; advice: sentences, the first is the most
-    important."""
-
-    title: str
-    advice: tuple[str, ...]
-    tables: tuple[Grid, ...]
-    coverage: tuple[tuple[str, str], ...]
-
-    @property
-    def line(self) -> str:
-        """The state in one line."""
-        words = (f"{row[0]} {row[2]}" + f" ({row[5]} with target)" * bool(row[5]) for row in self.tables[0].rows)
-        sensors = ", ".join(words)
-        return f"{self.title}: {sensors or 'nothing has arrived'}. {self.advice[0] if self.advice else ''}".rstrip()
-
-
 def view(f: Follower, prediction: Expectation | None) -> View:
     """What is known of a recording, and predicted."""
     cameras = [(name, f.topics[t.name]) for name, t in f.sensors.items() if t.kind == "image"]
     maps = tuple((name, coverage_map(a.cells.tolist())) for name, a in cameras if a.seen)
     tables = [_arrived(f)]
-    if f.motion.count:
-        tables.append(_moved(f, prediction))
     if prediction is not None and prediction.stds:
         tables.append(_expected_table(prediction))
+    if f.motion.count:
+        tables.append(_moved(f, prediction))
     return View(f"{f.root}, {f.seconds:.0f} s recorded", tuple(_advice(f, prediction)), tuple(tables), maps)
 
 
@@ -528,8 +522,8 @@ def _arrived(f: Follower) -> Grid:
         cells = f"{(a.cells > 0).sum()} of {a.cells.size}" if a.seen else ""
         rate = f"{a.rate_hz:.1f} Hz" if a.rate_hz else f"{a.topic.count} messages"
         rows.append((names.get(topic, ""), topic, rate, f"{time.monotonic() - a.arrived:.1f}", now, share, cells))
-    headers = ("sensor", "topic", "rate", "last [s ago]", "target", "of images", "cells covered")
-    return Grid("What arrives", headers, tuple(rows))
+    headers = ("sensor", "topic", "rate", "age [s]", "target", "of images", "cells")
+    return Grid("What arrives", headers, tuple(rows), len(names), 1)
 
 
 def _moved(f: Follower, prediction: Expectation | None) -> Grid:
@@ -539,23 +533,26 @@ def _moved(f: Follower, prediction: Expectation | None) -> Grid:
     figures = {f"rotation about {name} [deg/s]": np.rad2deg(f.motion.rates(R)) for name, R in frames.items()}
     figures[f"acceleration along {imu} [m/s^2]"] = f.motion.shaking()
     rows = tuple((what, *(f"{v:.1f}" for v in values)) for what, values in figures.items())
-    return Grid("Motion so far (RMS)", ("", "x", "y", "z"), rows)
+    return Grid("Motion (RMS)", ("", "x", "y", "z"), rows, len(rows), 5)
 
 
 def _expected_table(prediction: Expectation) -> Grid:
-    """Standard deviations of extrinsics, time offsets and lenses, one row for each group."""
+    """Standard deviations of extrinsics, time offsets and lenses, one row for each group: of a long one, the
+    number that is farthest from its tolerance. Those that are determined come last."""
     rows = []
     for (sensor, group), alike in groupby(prediction.stds, key=lambda s: (s.sensor, s.group)):
         stds = list(alike)
         unit, factor = display_unit(stds[0].unit)
         needed = max(s.needed_s for s in stds)
         state = "determined" if needed == 0.0 else f"{needed:.0f} s more" if np.isfinite(needed) else "move otherwise"
-        values = ", ".join(f"{factor * s.std:.3g}" if np.isfinite(s.std) else "unknown" for s in stds)
-        tolerance = f"{factor * stds[0].tolerance:.3g} {unit}"
-        name = group.replace("_", " ") + (f" {', '.join(s.label for s in stds)}" if len(stds) > 1 else "")
-        rows.append((sensor, f"{name} [{unit}]", values, tolerance, state))
-    title = f"Expected standard deviations, from the first {prediction.seconds:.0f} s"
-    return Grid(title, ("sensor", "parameter", "std", "tolerance", "until determined"), tuple(rows))
+        listed = stds if len(stds) <= 3 else [max(stds, key=lambda s: s.std / s.tolerance)]
+        values = ", ".join(f"{factor * s.std:.2g}" if np.isfinite(s.std) else "unknown" for s in listed)
+        name = group.replace("_", " ") + (f" {listed[0].label}" if len(stds) > 3 else "")
+        rows.append((sensor, name, values, f"{factor * listed[0].tolerance:.2g}", unit, state))
+    rows.sort(key=lambda row: row[-1] == "determined")
+    weak = sum(row[-1] != "determined" for row in rows)
+    title = f"Expected std, from the first {prediction.seconds:.0f} s"
+    return Grid(title, ("sensor", "parameter", "std (x, y, z)", "tolerance", "unit", "state"), tuple(rows), weak, 3)
 
 
 def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
@@ -563,7 +560,10 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     late = time.monotonic() - max((a.arrived for a in f.topics.values()), default=inf)
     if f.problem:
         yield f.problem
-    elif late > SILENT_S:
+    yield from f.unread.values()
+    if max(f.seconds, late) > SILENT_S:
+        yield from (f"{name}: {sentence}" for name, sentence in f.missing.items())
+    if late > SILENT_S and not f.problem:
         yield f"Nothing has arrived for {late:.0f} s: the recorder has ended, or its disk is full."
     if f.target is None:
         yield "Standard deviations are predicted with a target; give it, or its rig file, with --target FILE."
@@ -571,14 +571,14 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     cameras = {name: f.topics[t.name] for name, t in f.sensors.items() if t.kind == "image"}
     if any(a.searched for a in cameras.values()) and not any(a.sees for a in cameras.values()):
         yield f"The target is not in view of {' and '.join(cameras)}; bring it into view."
-    if prediction is None:
+    if prediction is None and f.topics:
         yield "Keep moving: there is too little yet for a prediction."
-    elif prediction.problem:
+    elif prediction is not None and prediction.problem:
         yield f"No prediction yet: {prediction.problem}"
         if f.motion.count:
             axis = f.motion.least_turned(np.eye(3))
             yield f"{next(iter(f.sensors))} turned least about its {axis} axis so far; turn about it, too."
-    else:
+    elif prediction is not None:
         yield from _next_motion(f, prediction)
     for name, a in cameras.items():
         if a.seen and (empty := empty_borders(a.cells.tolist())):
@@ -608,11 +608,12 @@ SILENT_S = 5.0  # recorders write a chunk more often
 LINE_EVERY_S = 5.0  # between lines where there is no terminal
 
 
-def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | None) -> None:
+def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | None, quiet: bool) -> None:
     """Shows the recording at `root` while it grows, until it is interrupted. address: of the page; None: no page.
+    quiet: nothing is printed.
 
     Raises CalibrationError if the address cannot be used."""
-    console, follower = Console(), Follower(root, given)
+    console, follower = Console(quiet=quiet), Follower(root, given)
     with closing(Page(address)) if address else nullcontext() as page, closing(Solver()) as solver:
         if page is not None:
             console.print(f"Page: http://{page.host}:{page.port}/", markup=False, highlight=False)
@@ -637,56 +638,8 @@ def _show(follower: Follower, solver: Solver, page: Page | None, console: Consol
                 if page is not None:
                     page.show(now)
                 if live is not None:
-                    live.update(Group(*_lines(now)), refresh=True)
+                    live.update(screen(now, *console.size), refresh=True)
                 elif begin - printed >= LINE_EVERY_S:
                     printed = begin
                     console.print(now.line, markup=False, highlight=False)
             time.sleep(max(LOOK_EVERY_S, time.monotonic() - begin))
-
-
-def _lines(now: View) -> Iterator[Any]:
-    """The view for a terminal."""
-    yield Text(now.title, style="bold")
-    yield from (Text(f"  {sentence}", style="yellow" if k == 0 else "") for k, sentence in enumerate(now.advice))
-    for grid in now.tables:
-        table = plain_table(grid.title, grid.headers, len(grid.headers), "")
-        for row in grid.rows:
-            table.add_row(*map(Text, row))
-        yield table
-    yield from (Text(f"{name}: corners over the image\n{cells}") for name, cells in now.coverage)
-
-
-class Page:
-    """A local page with the latest view, which refreshes itself. Raises CalibrationError if the address is taken."""
-
-    def __init__(self, address: tuple[str, int]) -> None:
-        self._body = ""
-        page, frame = self, render("tools/inspection/follow.html")
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
-                content = {"/": frame, "/body": page._body}.get(self.path)
-                self.send_response(404 if content is None else 200)
-                self.send_header("Content-Type", "text/html; charset=utf-8")
-                self.end_headers()
-                self.wfile.write((content or "").encode())
-
-            def log_message(self, format: str, *args: Any) -> None:
-                """Nothing: the terminal shows the recording."""
-
-        try:
-            self._server = ThreadingHTTPServer(address, Handler)
-        except OSError as error:
-            raise CalibrationError(
-                f"--serve {address[0]}:{address[1]} cannot be used ({error.strerror or error}); give another port."
-            ) from error
-        self.host, self.port = str(self._server.server_address[0]), int(self._server.server_address[1])
-        Thread(target=self._server.serve_forever, daemon=True).start()
-
-    def show(self, now: View) -> None:
-        """Replaces the content."""
-        self._body = render("tools/inspection/follow_body.html", now=now)
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
