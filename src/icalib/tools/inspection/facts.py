@@ -528,6 +528,7 @@ def frame_id(recording: Recording, topic: TopicInfo) -> str:
 # of sensors in formats that icalib does not read.
 
 _ORDER = ("problem", "warning", "hint")
+_STAMP_MS = 1e-6  # resolution of stamps
 _DRIFT_SIGMAS = 5.0  # standard deviations of a clock rate that is named
 
 
@@ -557,8 +558,8 @@ def _clock_rates(inspection: Inspection) -> Iterator[Finding]:
     """Hints on header stamps that drift against the receive times."""
     for stream in inspection.streams:
         rate = stream.clock_rate
-        if rate is not None and abs(rate.ppm) > _DRIFT_SIGMAS * rate.std_ppm:
-            drift_ms = 1e3 * PPM * abs(rate.ppm) * rate.duration_s
+        drift_ms = 1e3 * PPM * abs(rate.ppm) * rate.duration_s if rate else 0.0
+        if rate and drift_ms > _STAMP_MS and abs(rate.ppm) > _DRIFT_SIGMAS * rate.std_ppm:
             yield Finding(
                 "hint",
                 f"{stream.topic.name}: header stamps run {abs(rate.ppm):.3g} +- {rate.std_ppm:.2g} ppm "
