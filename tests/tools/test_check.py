@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from markupsafe import escape
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
+from tests.pages import figures_of
 
 import icalib
 from icalib.cli import main
@@ -24,7 +26,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.result import Calibration
 from icalib.result.saving import rig_of_result
 from icalib.rig.file import rig_to_dict
-from icalib.tools.check import Check, check_measurements, joint_limit, lines, verdict, with_places
+from icalib.tools.check import Check, check_html, check_measurements, joint_limit, lines, verdict, with_places
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate, write_tables
 
 pytestmark = pytest.mark.slow
@@ -132,6 +134,8 @@ def test_a_recording_that_is_too_short_and_one_of_another_rig(known: Calibration
     found = check_measurements(known, first(measured, 0.5))
     assert (found.validity, found.exit_code, found.new) == ("cannot say", 3, None)
     assert lines(found) == [f"Cannot say: {found.reason}"] and "the recording is too short" in found.reason
+    page = check_html(found, "out on short")
+    assert escape(lines(found)[0]) in page and re.findall('<section id="([^"]+)"', page) == ["trust"]
     with pytest.raises(CalibrationError, match="sigma must be a number above 0, but is -1"):
         check_measurements(known, measured, sigma=-1.0)
     with pytest.raises(RecordingError, match="cam1"):
@@ -163,8 +167,8 @@ def folders(known: Calibration, scenario: Scenario, tmp_path_factory: pytest.Tem
 
 
 def test_the_command(folders: Path, capsys: pytest.CaptureFixture[str]):
-    file = folders / "check.json"
-    arguments = ["check", str(folders / "out"), str(folders / "same"), "--json", str(file)]
+    file, page = folders / "check.json", folders / "check.html"
+    arguments = ["check", str(folders / "out"), str(folders / "same"), "--json", str(file), "--html", str(page)]
     assert main(arguments) == 0
     printed = capsys.readouterr().out.splitlines()
     assert printed[0].startswith("Residuals on the new recording") and printed[-1].startswith("Valid: ")
@@ -172,10 +176,24 @@ def test_the_command(folders: Path, capsys: pytest.CaptureFixture[str]):
     assert (plain["validity"], plain["sentence"], plain["changed"]) == ("valid", printed[-1], [])
     notes = [line.removeprefix("Note on the new recording: ") for line in printed if line.startswith("Note on the")]
     assert notes == plain["notes"]
+    text = page.read_text()
+    assert f'<p class="answer">{printed[-1]}</p>' in text and "out on same</title>" in text
+    shown = [line.strip() for line in printed[1:-1]]
+    assert all(escape(line.removeprefix("same").strip()) in text for line in shown if not line.endswith(":"))
+    assert set(figures_of(text)) == {"changes-in-sigma"} and text.count(">same</span>") == len(plain["differences"])
     names = {(d["sensor"], d["name"]) for d in plain["drifts"]}
     assert {("cam0", "rotation"), ("cam1", "time_offset"), ("cam1", "distortion")} <= names
     assert {f["kind"] for f in plain["residuals"]["fixed"]} >= {"corners", "gyroscope"}
     assert main([*arguments, "--quiet", "--from", "1", "--to", "6"]) == 0 and capsys.readouterr().out == ""
+
+
+def test_a_browser_draws_its_page(
+    known: Calibration, scenario: Scenario, assert_drawn: Callable[[str, set[str]], None]
+):
+    found = check_measurements(known, simulate(turned(scenario, ("cam1",)), 9).measurements)
+    page = check_html(found, "out on turned")
+    assert ">changed</span>" in page and '<section id="trust" class="bad">' in page
+    assert_drawn(page, {"changes-in-sigma"})
 
 
 def test_other_paths_and_topics(folders: Path, known: Calibration, capsys: pytest.CaptureFixture[str]):

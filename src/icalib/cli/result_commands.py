@@ -126,6 +126,7 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
     sigma = "ignore changes that chance explains up to N sigma; default: 3"
     c.add_argument("--sigma", type=float, default=3.0, metavar="N", help=sigma)
     c.add_argument("--json", type=file_path, metavar="FILE", help="write residuals, drift and verdict as JSON")
+    c.add_argument("--html", type=file_path, metavar="FILE", help="write verdict, changes and residuals as a page")
     c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_check, error_code=2)
 
@@ -134,10 +135,10 @@ def _check(options: argparse.Namespace) -> int:
     from icalib.base.files import refuse_foreign, set_of, write_sealed
     from icalib.cli.console import console_progress
     from icalib.result import load_calibration
-    from icalib.tools.check import check_calibration, check_json, lines, with_places
+    from icalib.tools.check import check_calibration, check_html, check_json, lines, with_places
 
-    if options.json:
-        refuse_foreign([options.json], [*set_of(options.result), *options.recording], "choose another place")
+    written = [path for path in (options.json, options.html) if path]
+    refuse_foreign(written, [*set_of(options.result), *options.recording], "choose another place")
     calibration = load_calibration(options.result)
     calibration = with_places(calibration, topic=dict(options.topic), path=dict(options.path))
     with console_progress(options.quiet) as progress:
@@ -145,6 +146,9 @@ def _check(options: argparse.Namespace) -> int:
         check = check_calibration(calibration, options.recording, progress, sigma=options.sigma, **part)
     if options.json:
         write_sealed(options.json, check_json(check))
+    if options.html:
+        recordings = ", ".join(path.name for path in options.recording)
+        write_sealed(options.html, check_html(check, f"{options.result.name} on {recordings}"))
     if not options.quiet:
         print("\n".join(lines(check)))
     return check.exit_code
@@ -196,6 +200,7 @@ def _add_compare(commands: argparse._SubParsersAction[CommandParser]) -> None:
     frame = "name in B of a sensor of A (in a URDF its link), if it differs; may be repeated"
     c.add_argument("--frame", type=_pair, action="append", default=[], metavar="SENSOR=NAME", help=frame)
     c.add_argument("--json", type=file_path, metavar="FILE", help="write the differences as JSON")
+    c.add_argument("--html", type=file_path, metavar="FILE", help="write them as a page")
     c.add_argument("--quiet", "-q", action="store_true", help="print nothing; use the exit code")
     c.set_defaults(run=_compare, error_code=2)
 
@@ -217,16 +222,17 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 def _compare(options: argparse.Namespace) -> int:
     from icalib.base.files import refuse_foreign, set_of, write_sealed
-    from icalib.tools.comparison.compare import ComparisonTolerances, comparison_json, lines
+    from icalib.tools.comparison.compare import ComparisonTolerances, comparison_html, comparison_json, lines
     from icalib.tools.comparison.reading import compare_files
 
-    if options.json:
-        inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
-        refuse_foreign([options.json], inputs, "choose another place")
+    inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
+    refuse_foreign([path for path in (options.json, options.html) if path], inputs, "choose another place")
     tolerances = ComparisonTolerances(**dict(options.tolerance))
     comparison = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:
         write_sealed(options.json, comparison_json(comparison))
+    if options.html:
+        write_sealed(options.html, comparison_html(comparison))
     if not options.quiet:
         print("\n".join(lines(comparison)))
     return 0 if comparison.same else 1

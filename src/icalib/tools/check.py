@@ -23,7 +23,15 @@ from icalib.result.saving import rig_of_result
 from icalib.result.verdict import AUXILIARY, UNUSABLE, counted
 from icalib.rig import Rig
 from icalib.sensors.sensor import MOUNTED_NAMES
-from icalib.tools.comparison.compare import Comparison, Difference, compare_sides, sentence, side_of_result, sigmas
+from icalib.tools.comparison.compare import (
+    Comparison,
+    Difference,
+    changes_html,
+    compare_sides,
+    sentence,
+    side_of_result,
+    sigmas,
+)
 
 __all__ = ["Check", "GroupDifference", "Validity", "check_calibration", "check_measurements", "with_places"]
 
@@ -209,6 +217,7 @@ def _drifts(old: Calibration, new: Calibration) -> list[GroupDifference]:
 # Result of a check as sentences, and as JSON.
 
 _EXTRINSICS = ("rotation", "translation")
+_NO_SOLUTION = "the new recording has no solution with the calibration fixed."
 
 
 def lines(check: Check) -> list[str]:
@@ -220,13 +229,33 @@ def lines(check: Check) -> list[str]:
         )
         text_lines += [f"  {line}" for line in _fit_lines(check.fits)]
     elif check.new is not None:
-        text_lines.append("Residuals: the new recording has no solution with the calibration fixed.")
+        text_lines.append(f"Residuals: {_NO_SOLUTION}")
     if check.comparison is not None:
         text_lines.append("Changes from the calibration (A) to the new recording (B):")
         for d in sorted(check.tested, key=lambda d: d not in check.changed):
             text_lines.append(f"  {'CHANGED' if d in check.changed else 'same   '}  {sentence(d, check.comparison)}")
+    return [*text_lines, *_notes(check), verdict(check)]
+
+
+def check_html(check: Check, title: str) -> str:
+    """The check as one HTML document. title: names of the calibration and the recording."""
+    trust = {"valid": "good", "changed": "bad", "cannot say": "care"}[check.validity]
+    return changes_html(
+        check.comparison,
+        check.tested,
+        check.changed,
+        title=title,
+        question="Is the calibration still valid?",
+        answer=verdict(check),
+        trust=trust,
+        notes=_notes(check),
+        residuals=_fit_lines(check.fits) or ([] if check.new is None else [_NO_SOLUTION]),
+    )
+
+
+def _notes(check: Check) -> list[str]:
     notes = () if check.new is None else check.new.reasons
-    return [*text_lines, *(f"Note on the new recording: {n}" for n in notes if n != check.reason), verdict(check)]
+    return [f"Note on the new recording: {n}" for n in notes if n != check.reason]
 
 
 def verdict(check: Check) -> str:

@@ -5,14 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from markupsafe import escape
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2, norm
+from tests.pages import figures_of
 
 from icalib.cli import main
 from icalib.export.formats import export
@@ -345,12 +348,17 @@ def test_lenses_of_other_models_are_compared_by_pixels(robot: Calibration):
 def test_exit_codes(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str], target: str, code: int):
     a, b = folders
     found = b.parent / "found.json"
-    assert main(["compare", str(a), str(b.parent / target), "--json", str(found)]) == code
+    page = b.parent / "found.html"
+    assert main(["compare", str(a), str(b.parent / target), "--json", str(found), "--html", str(page)]) == code
     printed = capsys.readouterr().out
     assert ("DIFFERS" in printed) == bool(code)
     data = json.loads(found.read_text())
     assert data["same"] is not bool(code) and data["a"] == {"path": str(a), "kind": "result"}
     assert all(d["sentence"] in printed for d in data["differences"])
+    text = page.read_text()
+    assert all(escape(d["sentence"]) in text for d in data["differences"])
+    assert text.count(">changed</span>") == sum(d["differs"] for d in data["differences"])
+    assert f'<p class="answer">{printed.splitlines()[-1]}</p>' in text
     if code:
         worst = next(d for d in data["differences"] if d["differs"])
         assert (worst["sensor"], worst["what"]) == ("cam1", "rotation")
@@ -360,6 +368,21 @@ def test_exit_codes(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[st
         == 0
     )
     assert capsys.readouterr().out == ""
+
+
+def test_a_page_shows_what_differs_first(
+    folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str], assert_drawn: Callable[[str, set[str]], None]
+):
+    page = folders[1].parent / "page.html"
+    assert main(["compare", *map(str, folders), "--html", str(page)]) == 1
+    text = page.read_text()
+    bars = figures_of(text)["changes-in-sigma"]["data"][0]
+    assert bars["y"][0] == "cam1 rotation from imu0" and bars["x"][0] > 3.0
+    assert len(bars["y"]) == len(set(bars["y"])) == len(bars["marker"]["color"])
+    capsys.readouterr()
+    assert main(["compare", *map(str, folders), "--html", str(folders[0] / "result.json"), "-q"]) == 2
+    assert "result.json is an input of this command" in capsys.readouterr().err
+    assert_drawn(text, {"changes-in-sigma"})
 
 
 @pytest.mark.parametrize(

@@ -580,6 +580,58 @@ def comparison_json(comparison: Comparison) -> str:
     return printable(json_text(plain))
 
 
+def comparison_html(comparison: Comparison) -> str:
+    """The comparison as one HTML document."""
+    c = comparison
+    return changes_html(
+        c,
+        c.differences,
+        tuple(d for d in c.differences if d.differs),
+        title=f"{c.a.path} and {c.b.path}",
+        answer=lines(c)[-1],
+        trust="good" if c.same else "care",
+        notes=c.notes,
+    )
+
+
+def changes_html(
+    c: Comparison | None, differences: tuple[Difference, ...], changed: tuple[Difference, ...], **values: object
+) -> str:
+    """One HTML document about `differences` of `c`, those in `changed` first. c: None if there is nothing to compare;
+    values: what else its template names."""
+    from icalib.report.page import document  # takes a second
+
+    ordered = sorted(differences, key=lambda d: d not in changed)
+    plots = [_plot(ordered, changed)] if any(d.sigmas is not None for d in ordered) else []
+    sides = f"A: {c.a.path} ({c.a.kind}), B: {c.b.path} ({c.b.kind})" if c else ""
+    rows = [_row(d, c, d in changed) for d in ordered] if c else []
+    others = {"residuals": [], "question": "What changed?"}
+    return printable(
+        document("tools/comparison/page.html", plots, plots=plots, sides=sides, rows=rows, **others | values)
+    )
+
+
+def _row(d: Difference, c: Comparison, changed: bool) -> tuple[str, ...]:
+    """Verdict, sentence, and standard deviations of at most three numbers of a difference, as text."""
+    std = f"{', '.join(map(digits, d.std))} {d.unit}" if d.std and len(d.std) <= 3 else ""
+    return "changed" if changed else "same", sentence(d, c), std
+
+
+def _plot(differences: list[Difference], changed: tuple[Difference, ...]) -> Any:
+    """Bars of the sigmas of all differences that have some."""
+    from icalib.report.figures import COLORS, REJECTED, axis, figure
+    from icalib.report.page import Plot
+
+    known = [d for d in differences if d.sigmas is not None]
+    names = [f"{d.sensor} {d.what}" + (f" from {d.frame}" if d.frame != d.sensor else "") for d in known]
+    colors = [REJECTED if d in changed else COLORS[0] for d in known]
+    sizes = [round(d.sigmas or 0.0, 2) for d in known]
+    bars = {"type": "bar", "orientation": "h", "x": sizes, "y": names, "marker": {"color": colors}}
+    rows = axis("", automargin=True, autorange="reversed")
+    drawn = figure([bars], 24 * len(known) + 110, xaxis=axis("change [sigma]"), yaxis=rows)
+    return Plot("changes-in-sigma", drawn, "Size of each change", "In standard deviations of both sides. Red: changed.")
+
+
 def digits(value: float) -> str:
     """The value with two significant digits; with an exponent below 1e-4 and from 1e5 on."""
     if value == 0.0 or not 1e-4 <= abs(value) < 1e5:
