@@ -167,7 +167,7 @@ def make_setup(
     bodies = Bodies(target, (1, 0, 2) if split else (0,), (), shape, sized=size)
     entries += bodies.size_entries() + bodies.shape_entries() + bodies.pose_entries()
     values = {(name, "shape"): np.zeros(len(SHAPE_LABELS)) for name in bodies.bending}
-    values["imu0", "intrinsics"] = truth.imu_intrinsics.copy()
+    values["imu0", "intrinsics"] = truth.values["imu0"]["intrinsics"].copy()
     values[SIZE] = np.array([truth.target_size])
     R_world_grid, origin = truth.T_world_board[:3, :3], truth.T_world_board[:3, 3]
     R_grid_scene, p_grid_scene = target.frame(1) if isinstance(target, SplitGrid) else (np.eye(3), np.zeros(3))
@@ -364,7 +364,10 @@ def make_room(
     entries.extend((*key, "plane", 3, True) for key in planes[sheet:])
     T, origin_s = truth.T_imu_sensor[stream.name], (stream.origin_ns - not_none(sim.measurements.imu).origin_ns) * 1e-9
     offset = truth.time_offset[stream.name] + origin_s
-    values = {("imu0", "intrinsics"): truth.imu_intrinsics.copy(), (stream.name, "time_offset"): np.array([offset])}
+    values = {
+        ("imu0", "intrinsics"): truth.values["imu0"]["intrinsics"].copy(),
+        (stream.name, "time_offset"): np.array([offset]),
+    }
     values |= {(stream.name, name): np.zeros(1) for name in ("range_offset", "range_scale", "clock_rate")}
     values[stream.name, MIDDLE] = stream.seconds[-1:] / 3.0
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()

@@ -126,7 +126,7 @@ def test_placed_on_a_known_motion(world, levelled):
     sim, imu, fix, _, offset = world
     keyframes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
     bias = np.tile(np.concatenate([sim.truth.gyro_bias[0], sim.truth.accel_bias[0]]), (len(keyframes), 1))
-    values = {("imu0", "intrinsics"): sim.truth.imu_intrinsics}
+    values = {("imu0", "intrinsics"): sim.truth.values["imu0"]["intrinsics"]}
     R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
     state = State(keyframes, R, p, v, bias, values)
     found = place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", fix, KnownPlace(levelled))
@@ -193,7 +193,14 @@ def test_fixes_in_another_frame_than_they_are_said_to_share(world):
     sim, imu, fix, _, _ = world
     keyframes = np.arange(0.2, imu.seconds[-1] - 0.2, 0.1)
     R, p, v = sim.truth.pose_at(keyframes + sim.truth.seconds[0])
-    state = State(keyframes, R, p, v, np.zeros((len(keyframes), 6)), {("imu0", "intrinsics"): sim.truth.imu_intrinsics})
+    state = State(
+        keyframes,
+        R,
+        p,
+        v,
+        np.zeros((len(keyframes), 6)),
+        {("imu0", "intrinsics"): sim.truth.values["imu0"]["intrinsics"]},
+    )
     known = KnownPlace(False, frame=PositionFrame(yaw(FRAME_YAW + 1.0), ORIGIN, ()))
     with pytest.raises(EstimationError, match="of their spread; .*in the frame that the rig file names"):
         place(EstimatedMotion(state, imu, GRAVITY, 0.5), "gnss0", fix, known)

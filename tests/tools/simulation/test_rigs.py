@@ -33,6 +33,7 @@ ALLOWED = (
     "icalib.rig",
     "icalib.sensors.camera.spec",
     "icalib.sensors.fields",
+    "icalib.sensors.imu.spec",
     "icalib.sensors.sensor",
     "icalib.sensors.stream",
     "icalib.tools.simulation",

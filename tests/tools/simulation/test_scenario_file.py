@@ -330,6 +330,7 @@ def test_effects_are_read(tmp_path):
         ("1.01", "0.01", "effects.target_size: is true over stated length"),
         ("0.02}", "2}", "effects.range_offset.top: must be between -0.5 and 0.5, but is 2."),
         (", 0.4]", "]", "top has 4 rings, but 3 elevation errors; give one for each ring."),
+        ("accel_scale: [0.01, 0.02, 0.03]", "cutoff: 1.0e-9", "effects.imu.cutoff: must be at least 1, but is 1e-09."),
     ],
 )
 def test_bad_effects_end_in_a_sentence(tmp_path, old, new, words):

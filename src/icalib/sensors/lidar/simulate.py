@@ -91,7 +91,9 @@ class SimLidar(SimSensor):
 
     def true_parameters(self) -> TrueParameters:
         true = {RANGE_SCALE.name: 1.0 / self.scale - 1.0, RANGE_OFFSET.name: self.range_offset_m}
-        return TrueParameters({name: np.array([value]) for name, value in true.items() if value})
+        rings = list(map(float, self.elevation_errors_deg))
+        entries = {"ring_elevations": rings} if any(rings) else {}
+        return TrueParameters({name: np.array([value]) for name, value in true.items() if value}, entries)
 
     @property
     def points(self) -> int:

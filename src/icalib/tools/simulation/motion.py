@@ -315,6 +315,7 @@ def _lines(path: Path) -> list[str]:
 # Simulated IMU readings: sensor model, bias random walk, white noise.
 
 _QUADRATURE_NODES = 6  # a motion below the Nyquist frequency is averaged to rounding
+_CUTOFF_NODES = 32  # one below seven times the cutoff, to 2e-8
 _LOWER = ((0, 1, 1, 2, 2, 2), (0, 0, 1, 0, 1, 2))  # row and column indices of xx, yx, yy, zx, zy, zz
 
 
@@ -364,7 +365,7 @@ def ideal_readings(scenario: Scenario, trajectory: TrueTrajectory, seconds: np.n
         shifts = [0.5 * steps * (node - 1.0) for node in nodes]
     else:
         sigma_s = np.sqrt(np.log(2.0)) / (2.0 * np.pi * (cutoff_hz or 0.5 / period))
-        nodes, weights = np.polynomial.hermite_e.hermegauss(_QUADRATURE_NODES)
+        nodes, weights = np.polynomial.hermite_e.hermegauss(_CUTOFF_NODES if cutoff_hz else _QUADRATURE_NODES)
         shifts = [np.full(len(seconds), sigma_s * node) for node in nodes]
     shares = weights / weights.sum()
     return np.sum([w * trajectory.readings_at(seconds + s) for w, s in zip(shares, shifts, strict=True)], axis=0)

@@ -13,6 +13,7 @@ import numpy as np
 from icalib.data.measurements import CornerStream, ImuStream, Measurements
 from icalib.errors import RecordingError
 from icalib.geometry.targets.base import BOARD
+from icalib.sensors.imu.spec import ACCEL_DELAY, INTRINSICS, LOW_PASS
 from icalib.sensors.sensor import CLOCK_RATE, mounted
 from icalib.tools.simulation.corners import CornerTruth, SimulatedTracks, TrackTruth, follow, see_corners
 from icalib.tools.simulation.ground import ground_motion
@@ -60,7 +61,6 @@ class Truth:
     velocity: np.ndarray  # (N, 3) m/s, world
     gyro_bias: np.ndarray  # (N, 3) rad/s
     accel_bias: np.ndarray  # (N, 3) m/s^2
-    imu_intrinsics: np.ndarray  # (24,)
     target_size: float
     gravity: np.ndarray  # (3,) m/s^2, world
     T_world_bodies: np.ndarray  # (bodies, 4, 4), in the order of the target's bodies
@@ -144,6 +144,14 @@ def true_values(scenario: Scenario, sensor: SimCamera | SimSensor) -> dict[str, 
     return {**mounted(T[:3, :3], T[:3, 3], offset), **rate, **sensor.true_parameters().values}
 
 
+def _imu_values(scenario: Scenario) -> dict[str, np.ndarray]:
+    """True parameters of the first IMU; of a low-pass half the variance of its response."""
+    values = {INTRINSICS.name: scenario.imu_intrinsics, ACCEL_DELAY.name: np.array([scenario.imu_accel_delay_s])}
+    if scenario.imu_cutoff_hz is not None:
+        values[LOW_PASS.name] = np.array([0.5 * np.log(2.0) / (2.0 * np.pi * scenario.imu_cutoff_hz) ** 2])
+    return values
+
+
 def _motion(scenario: Scenario, seed: int) -> TrueTrajectory:
     """The true trajectory."""
     motion = scenario.motion
@@ -206,14 +214,13 @@ def _rig_truth(scenario: Scenario) -> dict[str, Any]:
     """The fields of `Truth` that are copied from the scenario."""
     sensors = scenario.mounted
     return {
-        "imu_intrinsics": scenario.imu_intrinsics,
         "target_size": scenario.target_size,
         "gravity": GRAVITY_WORLD,
         "T_world_bodies": scenario.body_poses,
         "bow": np.array(scenario.bow),
         "planes": np.empty((0, 4)) if scenario.room is None else scenario.room.planes,
         "values": {
-            "imu0": {"intrinsics": scenario.imu_intrinsics},
+            "imu0": _imu_values(scenario),
             BOARD: {"size": np.array([scenario.target_size])},
             **{sensor.name: true_values(scenario, sensor) for sensor in sensors},
         },

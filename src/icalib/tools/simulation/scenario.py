@@ -205,6 +205,7 @@ _IMU = {
     "g_sensitivity": tuple(range(15, 24)),
 }
 _LARGEST = 0.2  # limit of a relative error, which no usable sensor exceeds
+_LEAST_CUTOFF_HZ = 1.0  # of a low-pass, which leaves hardly any motion below; readings are exact for motion to 7 Hz
 
 
 def read_effects(value: YamlValue, sensors: Sequence[SimSensor]) -> dict[str, Any]:
@@ -244,7 +245,7 @@ def _of_imu(value: YamlValue) -> dict[str, Any]:
     if "accel_delay" in fields:
         changed["imu_accel_delay_s"] = limited(fields["accel_delay"], LEAD_S)
     if "cutoff" in fields:
-        changed["imu_cutoff_hz"] = fields["cutoff"].positive()
+        changed["imu_cutoff_hz"] = at_least(fields["cutoff"], _LEAST_CUTOFF_HZ)
     return changed
 
 

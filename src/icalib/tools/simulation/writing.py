@@ -194,7 +194,8 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
             "type": "imu",
             "gyro_bias": truth.gyro_bias[0].tolist(),
             "accel_bias": truth.accel_bias[0].tolist(),
-            "intrinsics": truth.imu_intrinsics.tolist(),
+            **_plain(truth.values["imu0"]),
+            **({} if scenario.imu_cutoff_hz is None else {"cutoff": scenario.imu_cutoff_hz}),
         }
     }
     for c in scenario.cameras:
@@ -203,12 +204,16 @@ def _plain_truth(scenario: Scenario, truth: Truth, seed: int) -> dict[str, Any]:
         sensors[c.name] = _mounted(truth, c.name, "camera") | {"model": c.model} | parameters
     for s in scenario.sensors:
         true = s.true_parameters()
-        values = {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in true.values.items()}
-        sensors[s.name] = {**_mounted(truth, s.name, s.sensor_type), **true.entries, **values}
+        sensors[s.name] = {**_mounted(truth, s.name, s.sensor_type), **true.entries, **_plain(true.values)}
     plain: dict[str, Any] = {"seed": seed, "gravity": truth.gravity.tolist(), "sensors": sensors}
     if scenario.board:
         plain |= {"T_world_bodies": truth.T_world_bodies.tolist(), "target_size": truth.target_size}
     return plain | {"planes": truth.planes.tolist()}
+
+
+def _plain(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Parameters as plain data by name, those of one number as a number."""
+    return {name: v.tolist() if v.size > 1 else float(v[0]) for name, v in values.items()}
 
 
 def _mounted(truth: Truth, name: str, kind: str) -> dict[str, Any]:
