@@ -85,6 +85,30 @@ def test_an_accelerometer_that_is_late_is_found(program: ModuleType, delay_s: fl
     assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
 
 
+STATED = [
+    ("accel_delay", Parameter("fixed", np.array([0.005])), False),
+    ("accel_delay", Parameter("fixed", np.zeros(1)), True),
+    ("accel_delay", Parameter("free", np.array([0.02])), False),
+    ("size_effect", Parameter("prior", np.full(6, 0.02), np.full(6, 1e-4)), True),
+]
+
+
+@pytest.mark.parametrize(("name", "stated", "wrong"), STATED)
+def test_a_stated_effect_of_the_imu_is_tested(program: ModuleType, name: str, stated: Parameter, wrong: bool):
+    """The accelerometer is 5 ms late, and its axes are at one place. A guess has no weight."""
+    scenario = replace(program.camera_imu(), imu_accel_delay_s=0.005 if name == "accel_delay" else 0.0)
+    rig = program.rig_of(scenario, program.KINDS["camera + IMU"])
+    rig = rig.with_("imu0", **{name: stated})
+    result = calibrate_measurements(rig, simulate(scenario, 1).measurements)
+    against = [w for w in result.warnings if w.name in ("fixed_value_contradicted", "prior_contradicted")]
+    assert [f"{name.replace('_', ' ')}" in w and "imu0" in w for w in against] == [True] * wrong
+    if stated.mode == "free":
+        free = calibrate_measurements(rig.with_("imu0", **{name: Parameter()}), simulate(scenario, 1).measurements)
+        estimate, unguessed = (x.group("imu0", name) for x in (result, free))
+        np.testing.assert_allclose(estimate.value, unguessed.value, rtol=0, atol=0.05 * unguessed.std[0])
+        assert [n.name for n in result.notes if n.name == "guess_contradicted"]
+
+
 @pytest.mark.parametrize("cutoff_hz", [8.0, pytest.param(50.0, marks=pytest.mark.full)])
 def test_a_filter_in_the_imu_is_named_where_it_smooths_the_motion(program: ModuleType, cutoff_hz: float):
     scenario = replace(program.camera_imu(), imu_cutoff_hz=cutoff_hz)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -181,19 +181,23 @@ def tolerance_of(layout: Layout, specs: Mapping[Key, ParameterSpec], settings: S
 # Iteration over, and replacement of, the parameter groups of the sensors of a rig.
 
 
-def groups_of(rig: Rig, sensors: Collection[Sensor] | None = None) -> Iterator[tuple[Sensor, str, Parameter]]:
-    """Yields (sensor, name of the group, group) of the `sensors`; by default of all but the IMU."""
-    for sensor in rig.mounted if sensors is None else sensors:
+def groups_of(rig: Rig) -> Iterator[tuple[Sensor, str, Parameter]]:
+    """Yields (sensor, name of the group, group) of all sensors, but not priors of a class of sensors."""
+    for sensor in rig.sensors.values():
         for name, value in vars(sensor).items():
-            if isinstance(value, Parameter):
+            if isinstance(value, Parameter) and not value.of_class:
                 yield sensor, name, value
 
 
-def with_groups(
-    rig: Rig, treated: Callable[[Sensor, str, Parameter], Parameter], sensors: Collection[Sensor] | None = None
-) -> Rig:
-    """The rig with each group of the `sensors`, see `groups_of`, replaced by `treated(sensor, name, group)`."""
+def usual(sensor: Sensor, name: str) -> Parameter:
+    """How the group is estimated of which the rig file says nothing."""
+    default: Parameter = getattr(type(sensor), name)
+    return Parameter() if default.mode == "fixed" else default
+
+
+def with_groups(rig: Rig, treated: Callable[[Sensor, str, Parameter], Parameter]) -> Rig:
+    """The rig with each group of its sensors, see `groups_of`, replaced by `treated(sensor, name, group)`."""
     changed: dict[str, dict[str, Parameter]] = {}
-    for sensor, name, group in groups_of(rig, sensors):
+    for sensor, name, group in groups_of(rig):
         changed.setdefault(sensor.name, {})[name] = treated(sensor, name, group)
     return rig.with_sensors(*(replace(rig.sensors[name], **groups) for name, groups in changed.items()))

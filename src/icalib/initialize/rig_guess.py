@@ -13,7 +13,7 @@ import numpy as np
 from icalib.data.measurements import Measurements, PoseStream
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Callbacks
-from icalib.estimate.inputs import Inputs, groups_of, inputs_for, with_groups
+from icalib.estimate.inputs import Inputs, groups_of, inputs_for, usual, with_groups
 from icalib.estimate.problem import Problem, keyframe_times, keyframes_for, resample, start_values
 from icalib.estimate.residual_statistics import chi2_by_kind
 from icalib.estimate.solver import Step, Visit
@@ -289,14 +289,12 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
     intrinsics are kept as guesses, because not every motion makes them observable. None if it fails again."""
 
     def bare(lens: bool) -> Rig:
-        return with_groups(
-            rig,
-            lambda sensor, name, p: (
-                Parameter("free", p.value if lens and name in LENS else None)
-                if dropped(p) and p.value is not None
-                else p
-            ),
-        )
+        def treated(sensor: Sensor, name: str, p: Parameter) -> Parameter:
+            if p.value is None or not dropped(p) or sensor.spec(name).is_considered:
+                return p  # what a recording hardly shows explains no failure
+            return Parameter("free", p.value) if lens and name in LENS else usual(sensor, name)
+
+        return with_groups(rig, treated)
 
     fallback = _converged_attempt(bare(False), make)
     return fallback if fallback is not None or rig.has_target else _converged_attempt(bare(True), make)

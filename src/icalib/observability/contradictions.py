@@ -155,6 +155,7 @@ def _difference(
     else:
         shift = origin_difference(inputs.measurements, inputs.stream(block.sensor))
         value = value + step - (shift if block.name == "time_offset" else 0.0)
+        value = np.maximum(value, sensor.spec(block.name).least)
         difference = value - parameter.value
     return Contradiction(
         block.key, sensor.spec(block.name), parameter, value, difference, factor * sigma[block.columns]

@@ -24,9 +24,9 @@ from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
 from icalib.estimate.estimate import Estimate
-from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, with_association, with_groups
+from icalib.estimate.inputs import UNGUESSED_SIGMA, Inputs, groups_of, usual, with_association, with_groups
 from icalib.estimate.parameter_changes import SIGNIFICANT, least_chi2
-from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma, stated_priors
+from icalib.estimate.problem import Problem, begun, given_priors, guess_sigma
 from icalib.estimate.residual_statistics import Segments, calibration_columns, noise_variance, spread_variance
 from icalib.estimate.solver import Linearised, Outcome, outcome_of
 from icalib.geometry import planes, so3
@@ -289,7 +289,7 @@ class Relaxed:
 
     def _priors_of(self, freed: Collection[Key]) -> tuple[np.ndarray, np.ndarray]:
         """Gradient (B,) and information (B, B) of the priors on the groups `freed`."""
-        priors = [p for p in stated_priors(self.inputs) if p.block.key in freed]
+        priors = [p for p in self.problem.priors if p.block.key in freed]
         return sums_of_priors(priors, self.state, self.layout.size)[1:]
 
 
@@ -356,14 +356,14 @@ def stated_keys(inputs: Inputs, layout: Layout) -> list[Key]:
     Without a real IMU the pose of the reference sensor defines the body frame, so it is no stated value. With assumed
     motion neither is its time offset.
     """
-    user_rig, used = inputs.user_rig or inputs.rig, {s.name for s in inputs.rig.mounted}
+    user_rig = inputs.user_rig or inputs.rig
     body = () if inputs.rig.imu is not None and not inputs.rig.assumes_motion else ("rotation", "translation")
     if inputs.rig.assumes_motion:
         body = (*body, "time_offset")
     return [
         (s.name, name)
         for s, name, parameter in groups_of(user_rig)
-        if s.name in used and _is_stated(parameter)
+        if _is_stated(parameter)
         if not (s.name == user_rig.reference and name in body)
         if any(b.key == (s.name, name) and b.start is not None for b in layout.blocks)
     ]
@@ -495,13 +495,12 @@ def _with_effects(inputs: Inputs, effects: Collection[Key]) -> Inputs:
 
     def estimated(sensor: Sensor, name: str, p: Parameter) -> Parameter:
         if (key := (sensor.name, name)) in effects:
-            usual = getattr(type(sensor), name)
-            return Parameter() if usual.mode == "fixed" else usual
+            return usual(sensor, name)
         if p.mode != "fixed" or p.value is None or key in frame:
             return p
         return Parameter("prior", p.value, np.full(p.size, sensor.spec(name).prior_sigma))
 
-    return _of_rig(_sized(inputs), with_groups(rig, estimated, rig.sensors.values()))
+    return _of_rig(_sized(inputs), with_groups(rig, estimated))
 
 
 @dataclass(frozen=True)

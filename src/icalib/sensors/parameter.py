@@ -25,12 +25,14 @@ class Parameter:
     free: estimated, with `value` (if given) as initial guess. fixed: constant at `value`. prior: estimated, with a
     Gaussian prior of mean `value` and standard deviation `sigma`. value None: the program finds an initial guess.
     Rotations are 3x3 matrices R_imu_sensor with sigma (3,) in rad about the sensor's axes (right perturbation). Other
-    values are vectors with sigma of the same shape. Raises RigError for an invalid value or sigma.
+    values are vectors with sigma of the same shape. of_class: it is the prior of a class of sensors, not one that the
+    rig file states. Raises RigError for an invalid value or sigma.
     """
 
     mode: Mode = "free"
     value: np.ndarray | None = None
     sigma: np.ndarray | None = None
+    of_class: bool = False
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
@@ -186,10 +188,10 @@ class ParameterSpec:
     explains it. is_effect: zero of an ideal sensor; where the rig file gives no value, whether it is zero is tested.
     is_considered: all standard deviations then include the response to it, as far as prior and data let it differ from
     zero. starts_at_zero: needs no guess. largest: absolute value that the rig file may state, in `unit`; larger ones
-    were meant in another. by_images: determined by images, not by motion. motion: advice if the data do not determine
-    the group; {axes} stands for the axes about which the rig hardly turned. motion_on_wheels,
-    motion_without_target and motion_at_rest replace `motion` for rigs on wheels, without target, and where nothing
-    connects the instants.
+    were meant in another. least: smallest value that a sensor can have. by_images: determined by images, not by motion.
+    motion: advice if the data do not determine the group; {axes} stands for the axes about which the rig hardly turned.
+    motion_on_wheels, motion_without_target and motion_at_rest replace `motion` for rigs on wheels, without target, and
+    where nothing connects the instants.
     """
 
     name: str
@@ -208,6 +210,7 @@ class ParameterSpec:
     starts_at_zero: bool = False
     by_images: bool = False
     largest: float = np.inf
+    least: float = -np.inf
     motion: str = "move the rig more"
     motion_on_wheels: str = ""
     motion_without_target: str = ""

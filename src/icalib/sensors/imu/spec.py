@@ -91,6 +91,7 @@ LOW_PASS = ParameterSpec(
     labels=("low_pass",),
     tolerance=1e-4,
     prior_sigma=1e-5,  # a Gaussian filter of 30 Hz
+    least=0.0,
     is_auxiliary=True,
     is_effect=True,
     is_considered=True,
@@ -172,7 +173,7 @@ GyroUnit = Literal["rad/s", "deg/s"]
 IDEAL = Parameter("fixed")  # without an effect
 UNFILTERED = Parameter("fixed", np.zeros(LOW_PASS.size))  # known to have no filter
 BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs from `free()` by identity only
-_CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma) for n in IMU_CLASSES}
+_CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma, True) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
 _MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
@@ -223,12 +224,7 @@ class ImuSensor(MountedSensor):
             object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
         elif self.intrinsics.mode == "free":
             start = np.zeros(N_INTRINSICS) if self.intrinsics.value is None else self.intrinsics.value
-            object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma))
-        for spec in EFFECTS:
-            if (effect := getattr(self, spec.name)).mode == "free":
-                start = np.zeros(spec.size) if effect.value is None else effect.value
-                prior = Parameter("prior", start, np.full(spec.size, spec.prior_sigma))
-                object.__setattr__(self, spec.name, prior)
+            object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma, True))
 
     def specs(self) -> tuple[ParameterSpec, ...]:
         """See `Sensor`; extrinsics and time offset only where `mounted`, effects only where the rig file has them."""
