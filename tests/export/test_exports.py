@@ -25,7 +25,7 @@ from icalib.export.formats import FORMATS, export
 from icalib.geometry.cameras import camera_model
 from icalib.motion.imu_data import correction_matrices
 from icalib.result import Calibration, ParameterGroup
-from icalib.sensors.imu.spec import INTRINSICS_LABELS
+from icalib.sensors.imu.spec import EFFECTS, INTRINSICS_LABELS
 
 
 def by_opencv(text: str, tmp_path: Path) -> cv2.FileStorage:
@@ -429,6 +429,27 @@ def test_a_rolling_shutter_and_a_drifting_clock_are_said(robot: Calibration, to:
         assert data["sensors"]["lidar0"]["parameters"]["clock_rate"] == 80.0
         assert {"clock_rate", "readout"} <= data["conventions"].keys()
         assert "clock_rate" not in export(robot, to).files["calibration.json"]
+
+
+@pytest.mark.parametrize("to", FORMATS)
+def test_effects_on_the_imu_are_said(robot: Calibration, to: str):
+    """Kalibr has a field for the size effect, json for all, and COLMAP none for IMUs."""
+    values = (np.full(6, 1e-3), np.full(1, 5e-3), np.zeros(1))
+    more = [
+        ParameterGroup("imu0", spec.name, spec.labels, spec.unit, v, v, v, ("determined",) * spec.size, "prior")
+        for spec, v in zip(EFFECTS, values, strict=True)
+    ]
+    found = export(dataclasses.replace(robot, groups=(*robot.groups, *more)), to)
+    said, texts = " ".join(found.sentences), " ".join(found.files.values())
+    assert ("accel delay of imu0" in said) == (to not in ("colmap", "json"))
+    assert ("size effect of imu0" in said) == (to not in ("colmap", "json", "kalibr"))
+    assert "low pass of imu0" not in said
+    if to == "json":
+        assert json.loads(texts)["sensors"]["imu0"]["parameters"]["accel_delay"] == 5e-3
+    elif to == "kalibr":
+        assert "accel delay of imu0" in found.files["imu.yaml"] and "rz_i" in found.files["imu.yaml"]
+    else:
+        assert all(sentence in texts for sentence in found.sentences)
 
 
 def test_imu_intrinsics_that_have_no_place_are_said(robot: Calibration):

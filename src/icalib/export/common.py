@@ -19,6 +19,7 @@ from icalib.result import Calibration, Verdict
 from icalib.result.quantities import in_body_frame
 from icalib.result.verdict import TOO_UNCERTAIN
 from icalib.rig.rig import SENSOR_TYPES
+from icalib.sensors.imu.spec import EFFECTS, INTRINSICS
 from icalib.sensors.sensor import MOUNTED_NAMES
 
 
@@ -205,9 +206,11 @@ def imus(c: Calibration) -> tuple[str, ...]:
     return () if c.imu is None else (c.imu, *(name for name in c.of_type("imu") if name != c.imu))
 
 
-def imu_intrinsics(c: Calibration) -> list[str]:
-    """Words for scale and misalignment of the IMU, if any value is nonzero."""
-    return [f"scale and misalignment of {c.imu}"] if imu_values(c, c.imu).any() else []
+def imu_parameters(c: Calibration, names: Sequence[str], *kept: str) -> list[str]:
+    """Words for the groups of the IMUs `names` that are not zero, but for those `kept`, which the format has."""
+    words = {INTRINSICS.name: "scale and misalignment"} | {s.name: s.name.replace("_", " ") for s in EFFECTS}
+    groups = [g for g in c.groups if g.sensor in names and g.name in words and g.name not in kept]
+    return [f"{words[g.name]} of {g.sensor}" for g in groups if g.value.any()]
 
 
 def topic(c: Calibration, name: str, default: str) -> str:

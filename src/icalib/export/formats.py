@@ -29,7 +29,7 @@ from icalib.base.yaml_nodes import suggestion
 from icalib.errors import CalibrationError
 from icalib.export.colmap import colmap
 from icalib.export.common import Export, guessed_poses, guesses, imus, no_place_for, others, quaternion
-from icalib.export.kalibr import camchain, camchain_name, imu_yaml, kalibr_texts
+from icalib.export.kalibr import camchain, camchain_name, imu_omissions, imu_yaml, kalibr_texts
 from icalib.export.odometry import fast_lio, fast_livo2, lio_sam, mins, openvins, orb_slam3, vins_fusion
 from icalib.export.ros import autoware, camera_info, ros2_static, updated_urdf, urdf
 from icalib.report import report_html
@@ -126,7 +126,8 @@ def write_export(c: Calibration, to: str, folder: str | Path) -> tuple[str, ...]
 
 def kalibr(c: Calibration) -> Export:
     """Kalibr's camchain if there are cameras, and imu.yaml if there is an IMU."""
-    sentences = no_place_for("Kalibr", others(c, *c.cameras, *imus(c)[1:])) + guesses(c, c.cameras)
+    omissions = others(c, *c.cameras, *imus(c)[1:]) + imu_omissions(c)
+    sentences = no_place_for("Kalibr", omissions) + guesses(c, c.cameras)
     chain = camchain(c) if c.cameras else ""
     comments = "".join(f"# {sentence}\n" for sentence in sentences if sentence not in chain)
     files = {camchain_name(c): comments + chain} if c.cameras else {}

@@ -14,11 +14,13 @@ import yaml
 from icalib.errors import CalibrationError
 from icalib.export.common import (
     CameraParameters,
+    imu_parameters,
     imu_values,
     imus,
     inverse,
     lens_of,
     moving_offsets,
+    no_place_for,
     restarts,
     rolling_shutter,
     time_offset,
@@ -26,6 +28,7 @@ from icalib.export.common import (
 from icalib.geometry import so3
 from icalib.result import Calibration
 from icalib.sensors.camera.stream import CornerResiduals, image_of
+from icalib.sensors.imu.spec import INTRINSICS, SIZE_EFFECT
 
 # icalib model -> Kalibr's camera and distortion model, and the number of leading icalib distortion coefficients that
 # Kalibr lists as intrinsics before the focal lengths.
@@ -101,7 +104,13 @@ def imu_yaml(calibration: Calibration) -> str:
     comments = [comment, *_renamed("imu", imus(c))]
     if imus(c)[1:]:
         comments.append("# t_imu0 = t_imu + time_offset [s].")
+    comments += [f"# {sentence}" for sentence in no_place_for("Kalibr", imu_omissions(c))]
     return _text(comments, {f"imu{k}": _imu(c, name) for k, name in enumerate(imus(c))})
+
+
+def imu_omissions(c: Calibration) -> list[str]:
+    """Words for the parameters of IMUs that Kalibr lacks."""
+    return imu_parameters(c, imus(c), INTRINSICS.name, SIZE_EFFECT.name)
 
 
 def _imu(c: Calibration, name: str) -> dict[str, Any]:
@@ -162,7 +171,7 @@ def _lens_fields(lens: CameraParameters) -> dict[str, Any]:
 def _intrinsics(c: Calibration, imu: str) -> dict[str, Any]:
     """Kalibr's scale-misalignment model, gyro = M C_gyro_i w + A C_gyro_i f, of w and f in the axes of the
     accelerometer, and the places of its axes where they are estimated; empty if the IMU is assumed ideal."""
-    x, size = imu_values(c, imu), c.group_or_none(imu, "size_effect")
+    x, size = imu_values(c, imu), c.group_or_none(imu, SIZE_EFFECT.name)
     if not x.any() and size is None:
         return {}
     C_accel_gyro = _T_imu_kalibr(c, imu)[:3, :3].T

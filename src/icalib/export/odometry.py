@@ -14,7 +14,7 @@ from icalib.export.common import (
     Export,
     gravity,
     guesses,
-    imu_intrinsics,
+    imu_parameters,
     imu_values,
     imus,
     inverse,
@@ -33,6 +33,7 @@ from icalib.export.kalibr import KALIBR_NOISE, cam_overlaps, lower
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.result import Calibration
+from icalib.sensors.imu.spec import INTRINSICS
 
 # Export to OpenVINS: `kalibr_imucam_chain.yaml` and `kalibr_imu_chain.yaml`, the file names in its configuration.
 #
@@ -52,7 +53,8 @@ def openvins(c: Calibration) -> Export:
             raise CalibrationError(f"the rate of {name} is not known, and OpenVINS wants one; calibrate again.")
     lenses = [lens_of(c, name, "OpenVINS", tuple(MODELS)) for name in c.cameras]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
-    sentences += _offsets(c) + no_place_for("OpenVINS", others(c, *c.cameras, *imus(c)[1:])) + guesses(c, c.cameras)
+    omissions = others(c, *c.cameras, *imus(c)[1:]) + imu_parameters(c, imus(c), INTRINSICS.name)
+    sentences += _offsets(c) + no_place_for("OpenVINS", omissions) + guesses(c, c.cameras)
     overlaps = cam_overlaps(c)
     chain: dict[str, Any] = {}
     for i, (name, lens) in enumerate(zip(c.cameras, lenses, strict=True)):
@@ -144,7 +146,7 @@ def mins(c: Calibration) -> Export:
     pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
     positions = c.of_type("position")
     covered = [*c.cameras, *c.lidars, *pairs[:1], *positions]
-    sentences += no_place_for("MINS", [*imu_intrinsics(c), *others(c, *covered)]) + guesses(c, covered)
+    sentences += no_place_for("MINS", [*imu_parameters(c, imus(c)[:1]), *others(c, *covered)]) + guesses(c, covered)
     files = {"config_imu.yaml": _mins_imu(c, imu)}
     if c.cameras:
         cameras = {f"cam{i}": _mins_camera(c, name, lens) for i, (name, lens) in enumerate(lenses.items())}
@@ -242,7 +244,7 @@ def orb_slam3(c: Calibration) -> Export:
     lenses = [lens_of(c, name, "ORB-SLAM3", tuple(_TYPES)) for name in c.cameras[:_MOST]]
     names = c.cameras[: len(_alike(lenses))]
     lenses = lenses[: len(names)]
-    omissions = [*others(c, *names), *imu_intrinsics(c)]
+    omissions = [*others(c, *names), *imu_parameters(c, imus(c)[:1])]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence)
     sentences += no_place_for("ORB-SLAM3", [*omissions, *time_offsets(c, names)]) + guesses(c, names)
     lines = [
@@ -311,7 +313,7 @@ def vins_fusion(c: Calibration) -> Export:
     names = c.cameras[:_MOST]
     lenses = [lens_of(c, name, "VINS-Fusion", _MODELS) for name in names]
     sentences = tuple(lens.sentence for lens in lenses if lens.sentence) + _offset(c, names)
-    omissions = [*others(c, *names), *imu_intrinsics(c)]
+    omissions = [*others(c, *names), *imu_parameters(c, imus(c)[:1])]
     sentences += no_place_for("VINS-Fusion", omissions) + guesses(c, names)
     files = {"vins.yaml": _main(c, imu, names, lenses, sentences)}
     for i, (name, lens) in enumerate(zip(names, lenses, strict=True)):
@@ -401,7 +403,7 @@ def fast_lio(c: Calibration) -> Export:
     """FAST-LIO: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
-    omissions = [*others(c, *c.lidars), *imu_intrinsics(c)]
+    omissions = [*others(c, *c.lidars), *imu_parameters(c, imus(c)[:1])]
     sentences = no_place_for("FAST-LIO", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("FAST-LIO"),
@@ -427,7 +429,7 @@ def fast_livo2(c: Calibration) -> Export:
     camera = c.cameras[0]
     lens = lens_of(c, camera, "FAST-LIVO2", tuple(_LENSES))
     sentences = (lens.sentence,) if lens.sentence else ()
-    omissions = [*others(c, camera, *c.lidars), *imu_intrinsics(c)]
+    omissions = [*others(c, camera, *c.lidars), *imu_parameters(c, imus(c)[:1])]
     sentences += no_place_for("FAST-LIVO2", omissions) + guesses(c, [camera, *c.lidars])
     comments = [
         _MERGE.format("FAST-LIVO2"),
@@ -459,7 +461,7 @@ def lio_sam(c: Calibration) -> Export:
     """LIO-SAM: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "LIO-SAM")
     need(c.lidars, "LiDAR", "LIO-SAM")
-    omissions = [*others(c, *c.lidars), *imu_intrinsics(c), *time_offsets(c, c.lidars)]
+    omissions = [*others(c, *c.lidars), *imu_parameters(c, imus(c)[:1]), *time_offsets(c, c.lidars)]
     sentences = no_place_for("LIO-SAM", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("LIO-SAM"),

@@ -19,7 +19,8 @@ from icalib.export.common import (
     CameraParameters,
     Export,
     guessed_poses,
-    imu_intrinsics,
+    imu_parameters,
+    imus,
     inverse,
     lens_of,
     moving_offsets,
@@ -77,7 +78,7 @@ def generate_launch_description():
 def ros2_static(c: Calibration, frames: Mapping[str, str]) -> Export:
     """The file static_transforms.launch.py. frames: frame name by sensor, for sensors whose frame has another name."""
     offsets, lenses = time_offsets(c, c.mounted), [f"the lens of {name}" for name in c.cameras]
-    omissions = [*offsets, *lenses, *sensor_intrinsics(c), *imu_intrinsics(c)]
+    omissions = [*offsets, *lenses, *sensor_intrinsics(c), *imu_parameters(c, imus(c))]
     sentences = no_place_for("tf", omissions) + guessed_poses(c)
     parent = frames.get(c.body, c.body)
     comments = [
@@ -100,7 +101,7 @@ def camera_info(c: Calibration) -> Export:
     need(c.cameras, "camera", "CameraInfo")
     lenses = {name: lens_of(c, name, "CameraInfo", tuple(_DISTORTION)) for name in c.cameras}
     sentences = tuple(lens.sentence for lens in lenses.values() if lens.sentence)
-    omissions = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_intrinsics(c)]
+    omissions = ["poses", *time_offsets(c, c.mounted), *others(c, *c.cameras), *imu_parameters(c, imus(c)[:1])]
     sentences += no_place_for("CameraInfo", omissions) + moving_offsets(c, c.cameras)
     return Export({f"{name}.yaml": _info(name, lens, sentences) for name, lens in lenses.items()}, sentences)
 
@@ -142,7 +143,7 @@ def autoware(c: Calibration, frames: Mapping[str, str]) -> Export:
     """Poses of all sensors except wheels in the frame of the sensor kit, which is the body frame. frames: frame name by
     sensor, for sensors whose frame has another name."""
     names = [name for name in (c.body, *c.on_body) if name not in c.wheels]
-    omissions = [*sensor_intrinsics(c), *imu_intrinsics(c), *time_offsets(c, c.mounted), *c.wheels[1:]]
+    omissions = [*sensor_intrinsics(c), *imu_parameters(c, imus(c)), *time_offsets(c, c.mounted), *c.wheels[1:]]
     sentences = no_place_for("Autoware", [*omissions, *(f"the lens of {camera}" for camera in c.cameras)])
     sentences += guessed_poses(c)
     comments = [
@@ -319,7 +320,7 @@ def _attribute(tag: bytes, name: str, value: str) -> bytes:
 def _omissions(c: Calibration) -> tuple[str, ...]:
     """Sentences on calibrated values that URDF cannot represent."""
     omissions = time_offsets(c, c.mounted) + [f"the lens of {name}" for name in c.cameras]
-    omissions += sensor_intrinsics(c) + imu_intrinsics(c)
+    omissions += sensor_intrinsics(c) + imu_parameters(c, imus(c))
     return no_place_for("URDF", omissions) + guessed_poses(c)
 
 

@@ -19,7 +19,7 @@ from tests.pages import figures_of
 
 from icalib.cli import main
 from icalib.export.formats import export
-from icalib.result import Calibration, Verdict, relative_pose
+from icalib.result import Calibration, ParameterGroup, Verdict, relative_pose
 from icalib.sensors.fields import parameter_to_plain
 from icalib.sensors.parameter import fixed
 from icalib.tools.comparison.compare import (
@@ -210,6 +210,16 @@ def test_kalibr_files(robot: Calibration, tmp_path: Path):
     chain.write_text(yaml.safe_dump(data))
     moved = compare_files(tmp_path / "out", chain)
     assert not moved.same and only(moved, "cam1", "translation", "imu0").size == pytest.approx(10.0)
+
+
+def test_effects_on_the_imu_of_the_body_are_compared(robot: Calibration, tmp_path: Path):
+    one, sides = np.ones(1), []
+    for delay_s in (1e-3, 3e-3):
+        label, value = ("accel_delay",), delay_s * one
+        group = ParameterGroup("imu0", "accel_delay", label, "s", value, one, one, ("determined",), "prior")
+        sides.append(dataclasses.replace(robot, groups=(*robot.groups, group)))
+    assert only(compared(*sides), "imu0", "accel delay").size == pytest.approx(2.0)
+    assert not [d for d in compared(robot, sides[0]).differences if d.what == "accel delay"]
 
 
 def test_kalibrs_imu_frame_is_turned_to_the_gyroscope(robot: Calibration, tmp_path: Path):

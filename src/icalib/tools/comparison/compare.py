@@ -14,6 +14,7 @@ import numpy as np
 
 from icalib.base.files import json_text, printable
 from icalib.errors import CalibrationError
+from icalib.estimate.inputs import groups_of
 from icalib.geometry import so3
 from icalib.geometry.cameras import camera_model
 from icalib.result import Calibration, joint_covariance, relative_pose
@@ -281,17 +282,12 @@ def side_of_result(c: Calibration, path: str) -> Side:
     for g in c.groups:
         # If a clock restarts in each recording, its time offsets have no counterpart in another result.
         several = g.name == TIME_OFFSET.name and len(g.value) > 1
-        if g.sensor in c.mounted and not several:
+        if g.sensor in c.rig["sensors"] and not several:
             spec = compared_specs(SENSOR_TYPES[c.rig["sensors"][g.sensor]["type"]]).get(g.name)
             if spec is not None:
                 quantities[g.sensor, g.name] = quantity(spec, g.value, joint_covariance(c, [g]), g in bad)
     if c.imu is not None:
         quantities |= noise_quantities(c.imu, c.rig["sensors"][c.imu]["noise"])
-        intrinsics = [g for g in c.groups if (g.sensor, g.name) == (c.imu, "intrinsics") and g.columns is not None]
-        for g in intrinsics:
-            quantities[c.imu, g.name] = Quantity(
-                g.name, g.labels, g.value, joint_covariance(c, [g]), g in bad, g.unit, False
-            )
     return Side(
         path=path,
         kind="result",
@@ -331,12 +327,10 @@ def side_of_rig(path: Path) -> Side:
     rig = load_rig(path)
     poses = {s.name: _pose_of_rig(s) for s in rig.mounted} | {rig.reference: np.eye(4)}
     quantities = {}
-    for s in rig.mounted:
-        for spec in compared_specs(type(s)).values():
-            p: Parameter = getattr(s, spec.name)
-            if p.value is not None:
-                value = np.atleast_1d(p.value)
-                quantities[s.name, spec.name] = quantity(spec, value, _covariance(p, value.size))
+    for s, name, p in groups_of(rig):
+        spec = compared_specs(type(s)).get(name)
+        if spec is not None and p.value is not None:
+            quantities[s.name, name] = quantity(spec, p.value, _covariance(p, p.size))
     if rig.imu is not None:
         noise = {key: getattr(rig.imu.noise, key) for key in DENSITIES}
         quantities |= noise_quantities(rig.imu.name, noise)
