@@ -136,8 +136,9 @@ def with_further_imus(setup, number):
         entries += [(name, "time_offset", "vector", 1, True), (name, "intrinsics", "vector", 24, True)]
         values |= {(name, "rotation"): so3.exp(np.array([0.1, -0.2, 0.15]) * (k + 1.0))}
         values |= {(name, "translation"): np.array([0.1, 0.05, -0.08]), (name, "time_offset"): np.array([2e-3])}
-        entries += [(name, "size_effect", "vector", 6, True)]
+        entries += [(name, "size_effect", "vector", 6, True), (name, "clock_rate", "nuisance", 1, True)]
         values |= {(name, "intrinsics"): np.full(24, 1e-3), (name, "size_effect"): np.arange(6) * 1e-3}
+        values |= {(name, "clock_rate"): np.array([-90.0]), (name, MIDDLE): np.full(2, 0.3)}
     old = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     own = np.random.default_rng(3).normal(size=(len(setup.state.seconds), 9 * number)) * 0.05
     state = replace(setup.state, values=setup.state.values | values, further_imus=own)

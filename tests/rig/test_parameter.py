@@ -82,11 +82,6 @@ def test_a_value_of_another_size_is_refused_by_the_sensor(make: Callable[[Parame
         make(icalib.guess(np.arange(5.0)))
 
 
-def test_the_clock_of_an_imu_has_no_rate():
-    with pytest.raises(RigError, match=r"^i: the rate of an IMU's clock is not estimated; remove clock_rate\.$"):
-        ImuSensor("i", "i", ImuNoise(1, 1, 1, 1), clock_rate=icalib.fixed(0.0))
-
-
 def test_with_changes_one_thing_and_names_what_there_is():
     rig = Rig(
         by_name(

@@ -83,8 +83,7 @@ def test_no_table_lists_parameters_a_second_time():
 @each("kind", SENSOR_TYPES.values())
 def test_the_parameters_of_a_sensor_are_its_fields(kind: type[Sensor]):
     fields = {f.name for f in dataclasses.fields(kind) if f.type == "Parameter"}
-    refused = {"clock_rate"} if kind.is_inertial else set()
-    assert {spec.name for spec in kind.stated()} == fields - refused
+    assert {spec.name for spec in kind.stated()} == fields
     assert len({spec.name for spec in kind.parameters}) == len(kind.parameters)
 
 

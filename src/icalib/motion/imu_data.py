@@ -177,6 +177,11 @@ class ImuData:
         variance[gap] += walked**2 / 3.0
         return data
 
+    def at_pace(self, pace: float) -> ImuData:
+        """The same readings on a clock that counts `pace` seconds for each of the IMU's."""
+        gaps, seams = ((tuple((pace * a, pace * b) for a, b in spans)) for spans in (self.gaps, self.seams))
+        return replace(self, seconds=pace * self.seconds, gaps=gaps, seams=seams)
+
     def interval(self, seconds: np.ndarray) -> np.ndarray:
         """Index (n,) of the reading interval of each time; the first or last one for times outside."""
         return np.clip(np.searchsorted(self.seconds, seconds, side="right") - 1, 0, len(self.seconds) - 2)

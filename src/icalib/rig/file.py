@@ -17,7 +17,7 @@ from icalib.errors import RigError
 from icalib.geometry.targets import AprilGrid, Charuco, Checkerboard, Circles, Markers, NoTarget, Scene, Target
 from icalib.geometry.targets.families import family_name
 from icalib.rig.rig import ANYWHERE, SENSOR_TYPES, Gravity, Rig, Settings, by_name, gravity_to_plain, parse_gravity
-from icalib.sensors.sensor import MOUNTED_NAMES, TARGET_FRAME, Lack, Sensor, has_imu
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED_NAMES, TARGET_FRAME, Lack, Sensor, has_imu
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -299,13 +299,13 @@ def _lacks(rig: Rig) -> Iterator[Lack]:
 
 
 def _mounted_body(rig: Rig) -> Iterator[Lack]:
-    """Extrinsics or a time offset of the IMU to which those of all other sensors refer."""
+    """Extrinsics or a clock of the IMU to which those of all other sensors refer."""
     others = " or ".join(s.name for s in rig.further_imus)
     if (imu := rig.imu) is None:
         return
-    for name in MOUNTED_NAMES:
+    for name in (*MOUNTED_NAMES, CLOCK_RATE.name):
         stated = getattr(imu, name)
-        if stated.mode != "free" or stated.value is not None:
+        if stated.mode != getattr(type(imu), name).mode or stated.value is not None:
             advice = f", or make {others} the body with body: {rig.further_imus[0].name}" if others else ""
             yield Lack(
                 ("sensors", imu.name, name), f"{imu.name} is the body, to which this would refer; remove it{advice}."

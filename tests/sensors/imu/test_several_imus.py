@@ -206,13 +206,29 @@ def test_imus_that_do_not_match_are_refused_with_the_cause(name, recorded):
         calibrate_measurements(rig_for(recorded.scenario), changed(m, **change(m.streams["imu1"], m.streams["imu0"])))
 
 
-def test_the_body_has_no_extrinsics(recorded):
+@each(("field", "value"), [("translation", Parameter("free", np.zeros(3))), ("clock_rate", Parameter())])
+def test_the_body_has_neither_extrinsics_nor_a_clock(field, value, recorded):
     rig = rig_for(recorded.scenario)
-    stated = rig.with_("imu0", translation=Parameter("free", np.zeros(3)))
-    lack = lack_of(stated)
-    assert lack is not None and lack.where == ("sensors", "imu0", "translation")
+    lack = lack_of(rig.with_("imu0", **{field: value}))
+    assert lack is not None and lack.where == ("sensors", "imu0", field)
     assert "make imu1 or imu2 the body with body: imu1" in lack.sentence
     assert lack_of(rig) is None
+    again = rig_from_dict(rig_to_dict(rig.with_("imu1", **{field: value})), "rig.yaml")
+    assert rig_to_dict(again)["sensors"]["imu1"][field] in ("free", {"guess": [0.0] * 3})
+
+
+@pytest.mark.parametrize("ppm", [0.0, 100.0])
+def test_a_clock_that_drifts_is_found(ppm: float):
+    made = scenario(15.0)
+    made = made.with_sensors(replace(made.of(SimImu)[0], clock_rate_ppm=ppm))
+    simulation = simulate(replace(made, sensors=made.sensors[:1]), seed=2)
+    found = calibrate_measurements(rig_for(simulation.scenario).with_("settings", segments=8), simulation.measurements)
+    assert [n.name for n in found.notes].count("clock_rate_estimated") == (ppm > 0.0)
+    for key, error in errors(found, simulation, "imu1").items():
+        assert (np.abs(error) < 4.0 * found.group("imu1", key).std).all(), key
+    if ppm:
+        rate = found.group("imu1", "clock_rate")
+        assert abs(rate.value[0] - ppm) < 4.0 * rate.std[0] < 20.0
 
 
 def test_the_rig_file_keeps_all_imus(recorded):

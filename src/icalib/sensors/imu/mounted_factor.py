@@ -6,7 +6,7 @@ Its velocity is a state of its own, u = R_world_body^T (v - v_body), and so are 
 The body's angular rate and the lever arm also give the velocity. But a rate at one instant is a single noisy reading,
 and two intervals would share its noise. With a free velocity the readings of each IMU enter once, in its own factor,
 and it does not matter which IMU is the body. The lever arm shows in the rows of the position. A change of the time
-offset within a pass moves the poses, but not the velocity, which is free.
+offset or clock rate within a pass moves the poses, but not the velocity, which is free, nor the durations.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from icalib.base.compiled import njit
 from icalib.geometry import so3
 from icalib.motion.factor import FactorKey, Into, RobustNoise, RowFactor, Whitened, add_rows, rows_by_recording
 from icalib.motion.imu_data import ImuData, clear_of, without_effects
-from icalib.motion.poses import EstimatedMotion, gravity_of, seconds_at
+from icalib.motion.poses import EstimatedMotion, gravity_of, pace_of, seconds_at
 from icalib.motion.sensor_pose import Kinematics, SensorPose, add_pose_chain
 from icalib.optim.arrowhead import FIRST_BIAS_SIGMA, Piece
 from icalib.optim.rows import Rows
@@ -70,9 +70,9 @@ class MountedImuFactor(RowFactor):
     """All intervals of one mounted IMU between neighbouring keyframes; the rows are those of `ImuFactor`.
 
     readings: of the mounted IMU, corrected for effects on them. imu, gravity: readings of the body, and gravity [m/s^2]
-    where the state has none. seconds (K,): keyframes on its clock when the factor was built. increments: W is zero
-    where it has no readings, but for the biases. values0: free parameters then. state_column: of its velocity and
-    biases in a keyframe.
+    where the state has none. seconds (K,): keyframes on its clock when the factor was built; pace: see `pace_of`, then.
+    increments: W is zero where it has no readings, but for the biases. values0: free parameters then. state_column: of
+    its velocity and biases in a keyframe.
     """
 
     readings: ImuData
@@ -80,6 +80,7 @@ class MountedImuFactor(RowFactor):
     gravity: float
     layout: Layout
     seconds: np.ndarray
+    pace: float
     increments: Increments
     values0: np.ndarray
     starts: tuple[int, ...]
@@ -93,8 +94,9 @@ class MountedImuFactor(RowFactor):
         usable = readings.covers(seconds[:-1], seconds[1:]) & clear_of(readings.seams, seconds[:-1], seconds[1:])
         usable[np.array(state.starts[1:], dtype=np.int64) - 1] = False
         groups = free_groups(layout, name)
-        readings = without_effects(readings, state, bias[:, :3].mean(axis=0))
-        increments = preintegrated_with_jacobians(readings, seconds, usable, bias, intrinsics, groups)
+        readings, pace = without_effects(readings, state, bias[:, :3].mean(axis=0)), pace_of(state, name)
+        at_pace = readings.at_pace(pace)
+        increments = preintegrated_with_jacobians(at_pace, pace * seconds, usable, bias, intrinsics, groups)
         R = state.rotation @ state.values[name, "rotation"]
         # Zero residual without readings: Log of an arbitrary rotation may have no derivative.
         increments.dR[~usable] = (R[:-1].transpose(0, 2, 1) @ R[1:])[~usable]
@@ -108,6 +110,7 @@ class MountedImuFactor(RowFactor):
             motion.gravity,
             layout,
             seconds,
+            pace,
             increments,
             free_values(state, name, groups),
             state.starts,
@@ -174,7 +177,7 @@ class MountedImuFactor(RowFactor):
             "nij,nj->ni", state.rotation[keyframes], states[keyframes, :3]
         )
         bias = np.ascontiguousarray(states[:, 3:])
-        return Chain(R, p, v, bias, self.seconds, gravity_of(state, self.gravity))
+        return Chain(R, p, v, bias, self.pace * self.seconds, gravity_of(state, self.gravity))
 
     def _rows(self, state: State, chain: Chain, at: SensorPose, some: tuple[slice, int], jacobians: bool) -> Rows:
         """Rows of the intervals some[0]; some[1]: keyframe of the first pose in `at`."""

@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 
 from icalib.base.yaml_nodes import YamlValue
-from icalib.errors import RigError
 from icalib.sensors.fields import (
     TABLE,
     axes_or_none,
@@ -21,7 +20,7 @@ from icalib.sensors.fields import (
     vector_parameter,
 )
 from icalib.sensors.parameter import Parameter, ParameterSpec
-from icalib.sensors.sensor import MOUNTED, PLAIN_TABLE, Axes, MountedSensor, Sampling, TableLayout
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED, PLAIN_TABLE, Axes, MountedSensor, Sampling, TableLayout
 
 
 @dataclass(frozen=True)
@@ -176,14 +175,14 @@ BY_CLASS = Parameter("free")  # no `intrinsics` field in the rig file; differs f
 _CLASS_PRIORS = {n: Parameter("prior", np.zeros(N_INTRINSICS), class_imperfections(n).sigma, True) for n in IMU_CLASSES}
 _DENSITIES = ("gyro", "gyro_walk", "accel", "accel_walk")
 _FIELDS = ("accel_unit", "gyro_unit", "accel_axes", "gyro_axes", "sampling")
-_MOUNT = (*(spec.name for spec in MOUNTED), "clock_restarts")
+_MOUNT = (*(spec.name for spec in (*MOUNTED, CLOCK_RATE)), "clock_restarts")
 
 
 @dataclass(frozen=True)
 class ImuSensor(MountedSensor):
     """An IMU.
 
-    mounted: set by `Rig`; False for the IMU that is the body, which has neither extrinsics nor a time offset.
+    mounted: set by `Rig`; False for the IMU that is the body, which has neither extrinsics nor a clock of its own.
 
     Units and axes describe the recorded readings; None: SI units (g is recognised), and axes of the IMU frame.
     sampling: `interval-mean` for IMUs whose readings are angles and velocity changes over the time that they took.
@@ -197,7 +196,7 @@ class ImuSensor(MountedSensor):
     sensor_type: ClassVar[str] = "imu"
     noun: ClassVar[str] = "IMU"
     is_inertial: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, INTRINSICS, *EFFECTS)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, INTRINSICS, *EFFECTS)
 
     path: str | TwoSources
     noise: ImuNoise
@@ -218,8 +217,6 @@ class ImuSensor(MountedSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.clock_rate.mode != "fixed" or self.clock_rate.value is not None:
-            raise RigError(f"{self.name}: the rate of an IMU's clock is not estimated; remove clock_rate.")
         if self.intrinsics is BY_CLASS:
             object.__setattr__(self, "intrinsics", _CLASS_PRIORS[class_of_noise(self.noise)])
         elif self.intrinsics.mode == "free":
@@ -227,8 +224,8 @@ class ImuSensor(MountedSensor):
             object.__setattr__(self, "intrinsics", Parameter("prior", start, FREE.sigma, True))
 
     def specs(self) -> tuple[ParameterSpec, ...]:
-        """See `Sensor`; extrinsics and time offset only where `mounted`, effects only where the rig file has them."""
-        specs = self.parameters if self.mounted else self.parameters[len(MOUNTED) :]
+        """See `Sensor`; extrinsics and clock only where `mounted`, effects only where the rig file has them."""
+        specs = self.parameters if self.mounted else (INTRINSICS, *EFFECTS)
         parameters: dict[str, Parameter] = vars(self)
         ideal = [s for s in EFFECTS if (p := parameters[s.name]).mode == "fixed" and p.value is None]
         return tuple(spec for spec in specs if spec not in ideal)
@@ -243,7 +240,7 @@ class ImuSensor(MountedSensor):
             for field, kind in (("accel_unit", AccelUnit), ("gyro_unit", GyroUnit))
             if field in fields
         }
-        groups = parameters(fields, (*MOUNTED, *EFFECTS))
+        groups = parameters(fields, (*MOUNTED, CLOCK_RATE, *EFFECTS))
         if "intrinsics" in fields:
             groups["intrinsics"] = _intrinsics(fields["intrinsics"])
         return cls(
@@ -270,9 +267,9 @@ class ImuSensor(MountedSensor):
             if given is not None:
                 plain[field] = list(given) if isinstance(given, tuple) else given
         plain |= {"clock_restarts": True} if self.clock_restarts else {}
-        groups = {spec.name: getattr(self, spec.name) for spec in self.specs()}
-        ideal = [name for name, p in groups.items() if p.mode == "fixed" and p.value is None]
-        return plain | {name: "fixed" if name in ideal else parameter_to_plain(p) for name, p in groups.items()}
+        groups = {spec.name: parameter_to_plain(getattr(self, spec.name)) for spec in self.specs()}
+        groups[INTRINSICS.name] = groups[INTRINSICS.name] or "fixed"
+        return plain | {name: value for name, value in groups.items() if value is not None}
 
 
 def _noise(value: YamlValue) -> ImuNoise:
