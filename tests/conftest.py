@@ -190,9 +190,9 @@ def _tags_on_walls(room: tuple[float, float, float], a_wall: int) -> np.ndarray:
 
 
 @pytest.fixture
-def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
+def assert_drawn(tmp_path: Path) -> Callable[..., str]:
     """Fails where a browser finds an error in a page, leaves one of its figures undrawn when it is printed, or an entry
-    of its contents leads nowhere."""
+    of its contents leads nowhere. Returns the page as it is printed from a window that is `width` px wide."""
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
         pytest.skip("no chromium is installed; install one to have the report drawn")
@@ -204,9 +204,15 @@ def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
         "--enable-logging=stderr --v=0 --dump-dom --virtual-time-budget=8000"
     )
 
-    def draw(text: str, figures: set[str]) -> None:
+    def draw(text: str, figures: set[str], width: int = 800) -> str:
         file.write_text(text.replace("</body>", printing), encoding="utf-8")
-        command = [chromium, *flags.split(), f"--user-data-dir={tmp_path / 'profile'}", file.as_uri()]
+        command = [
+            chromium,
+            *flags.split(),
+            f"--window-size={width},600",
+            f"--user-data-dir={tmp_path / 'profile'}",
+            file.as_uri(),
+        ]
         found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
         assert not re.findall(r"CONSOLE.*(?:Error|error).*", found.stderr)
         for name in figures:
@@ -214,5 +220,6 @@ def assert_drawn(tmp_path: Path) -> Callable[[str, set[str]], None]:
         places = re.findall('<section id="([^"]+)"', text)
         assert re.findall('<a href="#([^"]+)"', text.split("<nav")[1].split("</nav>")[0]) == places
         assert len(re.findall(r'<svg class="main-svg"[^>]* width="[1-9]', found.stdout)) >= len(figures)
+        return found.stdout
 
     return draw

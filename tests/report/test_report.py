@@ -23,6 +23,7 @@ from icalib.export.formats import check_folder, write_outputs
 from icalib.report import report_html
 from icalib.report.console import legend, lens_words, relative_words, shown_rows, table
 from icalib.report.figures import numbers, thin
+from icalib.report.page import extrinsics, sensor_cards
 from icalib.result import (
     Calibration,
     ProjectionMap,
@@ -284,6 +285,33 @@ def test_a_poor_fit_colours_the_card(calibration: Calibration):
         assert f"residuals {size:.2g}x the stated noise" in page(size**2)
 
 
+def test_only_what_is_not_estimated_is_called_fixed(calibration: Calibration):
+    """Parameters with a prior have no verdict that counts, and were estimated."""
+
+    def cam0(fixed: bool) -> list[object]:
+        mode, names = "fixed" if fixed else "prior", lambda g: ("fixed",) * len(g.verdict) if fixed else g.verdict
+        groups = tuple(
+            dataclasses.replace(g, mode=mode, columns=None if fixed else g.columns, verdict=names(g))
+            for g in calibration.groups
+        )
+        c = dataclasses.replace(calibration, groups=groups)
+        return [next(x.verdict for x in sensor_cards(c) if x.sensor == "cam0"), *(r[1] for r in extrinsics(c)[:1])]
+
+    assert cam0(fixed=False) == ["determined", ""]  # the card is that of the lens, too
+    assert cam0(fixed=True) == ["fixed", "fixed"]
+
+
+def test_one_name_and_a_word_for_each_parameter(calibration: Calibration):
+    low_pass = {"value": [2e-6], "std": [1e-6], "labels": ["low_pass"], "unit": "s^2"}
+    size = {"value": [0.0, -0.004], "std": [1.0, 0.001], "labels": ["yx", "yy"], "unit": "m"}
+    c = dataclasses.replace(calibration, effects={"imu0.low_pass": low_pass, "imu0.size_effect": size})
+    text = report_html(c)
+    assert "In the frame of imu0. Red" in text and "In the frame of imu. " not in text
+    assert "<li>low_pass: low-pass filter of the IMU, as half the variance of its response.</li>" in text
+    assert "<td>yy -4 ± 1 mm</td>" in text and "<th>setting</th>" not in text
+    assert "<code>icalib view RESULT RECORDING</code>" in report_html(with_images(calibration))
+
+
 def test_rows_are_in_units_that_people_read(calibration: Calibration):
     found = {(r.sensor, r.name): r for r in rows(calibration)}
     yaw, z = found["cam0", "yaw"], found["cam0", "rotation z"]
@@ -449,5 +477,17 @@ def test_outputs_are_one_set(calibration: Calibration, tmp_path: Path):
     assert {p.name for p in (tmp_path / "out").iterdir()} == names
 
 
-def test_a_browser_draws_it(calibration: Calibration, assert_drawn: Callable[[str, set[str]], None]):
+def test_a_browser_draws_it(calibration: Calibration, assert_drawn: Callable[[str, set[str]], str]):
     assert_drawn(report_html(with_images(calibration)), FIGURES)
+
+
+def test_a_narrow_window_prints_figures_of_a_pair_side_by_side(
+    text: str, assert_drawn: Callable[[str, set[str], int], str]
+):
+    printed = assert_drawn(text, set(), 500)
+    widths = re.findall(
+        r'<div class="plot[^"]*" id="([\w-]+)".{,999}?<svg class="main-svg"[^>]* width="([\d.]+)"', printed, re.DOTALL
+    )
+    of = {name: float(width) for name, width in widths}
+    assert 600.0 < of["histogram"] < 688.0  # 182 mm
+    assert of["plane-0"] < 344.0 and of["image-0"] < 344.0

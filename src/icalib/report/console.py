@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
 from rich.table import Table
 from rich.text import Text
@@ -108,4 +110,9 @@ def legend(calibration: Calibration, entries: list[Row]) -> str:
     hidden = [row.group for row in table_rows(calibration) if row not in entries]
     text += f" -v adds {len(hidden)} rows: {', '.join(dict.fromkeys(hidden))}." if hidden else ""
     names = {row.group for row in entries}
-    return " ".join([text, *(f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.is_auxiliary and s.name in names)])
+    return " ".join([text, *meanings(names)])
+
+
+def meanings(names: Collection[str]) -> list[str]:
+    """Sentences on groups of parameters whose names do not explain them."""
+    return [f"{s.name}: {s.meaning}." for s in ALL_SPECS if s.meaning and s.name in names]

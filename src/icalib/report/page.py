@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Generic, TypeVar, cast
+from typing import Any, Generic, Literal, TypeVar, cast
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -20,6 +20,7 @@ from markupsafe import Markup
 from icalib.detection.images import MOST_PICTURES
 from icalib.kinds import presenters
 from icalib.report import pictures, rig_figures
+from icalib.report.console import meanings
 from icalib.report.figures import (
     CELL_PX,
     Figure,
@@ -76,6 +77,7 @@ from icalib.result.verdict import (
     tolerance,
     worst,
 )
+from icalib.sensors.parameter import display_unit
 from icalib.sensors.sensor import MOUNTED_NAMES
 from icalib.sensors.stream import Residuals
 
@@ -226,6 +228,8 @@ def report_html(calibration: Calibration) -> str:
         relative_matrices={r.name: _matrix_text(r.T) for r in relative_poses(c)},
         near_lock=NEAR_LOCK,
         facts=facts(c),
+        meanings=meanings({g.name for g in c.groups}),
+        tested=meanings({name.partition(".")[2] for name in c.effects}),
     )
 
 
@@ -271,7 +275,7 @@ def _ellipsoid_words(c: Calibration) -> str:
 
 def _plots(c: Calibration) -> dict[str, Plot]:
     """Plots that are not about one kind of sensor, by name."""
-    rig = f"In the frame of {reference_name(c)}. Red, green and blue are x, y and z"
+    rig = f"In the frame of {c.reference}. Red, green and blue are x, y and z"
     rig += "".join(f"; {legend}" for legend in rig_figures.legends(c))
     few = f"At most {rig_figures.MAX_PLOTTED_KEYFRAMES} keyframes are drawn."
     plots = [
@@ -341,18 +345,24 @@ def plotly_figure(drawn: Figure) -> Any:
 # Extrinsics on the first screen.
 
 
-def extrinsics(c: Calibration) -> list[tuple[str, Verdict, str, str, str]]:
+def extrinsics(c: Calibration) -> list[tuple[str, Verdict | Literal[""], str, str, str]]:
     """A row for each sensor with a place: name, verdict, and values with standard deviations of translation, rotation
     and time offset, as text."""
     out, entries = [], rows(c)
     for name in dict.fromkeys(r.sensor for r in entries if r.sensor in c.mounted or r.sensor == c.imu):
         groups = [g for g in in_body_frame(c).groups if g.sensor == name and g.name in MOUNTED_NAMES]
-        verdict = worst(tuple(v for g in groups for v in counted(c, g)))
+        verdict = _verdict(c, groups)
         cells = (_cell([r for r in entries if (r.sensor, r.group) == (name, g)]) for g in MOUNTED_NAMES)
         by_name = dict(zip(MOUNTED_NAMES, cells, strict=True))
         if any(by_name.values()):
             out.append((name, verdict, by_name["translation"], by_name["rotation"], by_name["time_offset"]))
     return out
+
+
+def _verdict(c: Calibration, groups: Iterable[ParameterGroup], lens: tuple[Verdict, ...] = ()) -> Verdict | Literal[""]:
+    """The worst verdict on a sensor: empty if none of what was estimated counts, as of parameters with a prior."""
+    verdict = worst((*lens, *(v for g in groups for v in counted(c, g))))
+    return "" if verdict == "fixed" and any(g.columns is not None for g in groups) else verdict
 
 
 def _cell(entries: list[Row]) -> str:
@@ -370,7 +380,7 @@ class Card:
     sensor: str
     kind: str
     css: str
-    verdict: Verdict
+    verdict: Verdict | Literal[""]
     marks: list[str]
     components: list[tuple[str, str, str, str]]
     fits: list[tuple[str, bool]]
@@ -409,11 +419,10 @@ def _card(c: Calibration, sensor: str) -> Card:
     stated noise."""
     lens, fits = c.lenses.get(sensor, ()), [f for f in c.fits if f.sensor == sensor]
     groups = [g for g in nontrivial_groups(in_body_frame(c)) if g.sensor == sensor and g.name not in AUXILIARY]
-    verdicts: list[Verdict] = [v for g in groups for v in counted(c, g)]
-    verdict = worst((*verdicts, *((lens_verdict(c, sensor),) if lens else ())))
+    verdict = _verdict(c, groups, (lens_verdict(c, sensor),) if lens else ())
     fit = max((excess(f) for f in fits), default=1.0)
     named = any(re.search(rf"(?<!\w){re.escape(sensor)}(?!\w)", sentence) for sentence in c.wrong)
-    css = "bad" if verdict in UNUSABLE or named or fit >= FAR_BEYOND else "weak" if fit > 1.0 else verdict
+    css = "bad" if verdict in UNUSABLE or named or fit >= FAR_BEYOND else "weak" if fit > 1.0 else verdict or "fixed"
     marks = [w for w, applies in (("poor fit", fit > 1.0), ("see the reasons", named and fit == 1.0)) if applies]
     components = _components(c, sensor, lens) if groups else []
     lines = [(_fit_words(f), excess(f) > 1.0) for f in fits]
@@ -473,14 +482,14 @@ def _relative_row(r: RelativePose) -> list[str]:
     return [r.name, *(f"{x:.3f} ± {format_number(s)}" for x, s in zip(values, std, strict=True))]
 
 
-def facts(c: Calibration) -> dict[str, dict[str, Any]]:
-    """Settings, effects that were tested, versions, wall times and sensor rates, by title."""
+def facts(c: Calibration) -> dict[tuple[str, str], dict[str, Any]]:
+    """Settings, effects that were tested, versions, wall times and sensor rates, by title and header of the names."""
     return {
-        "Settings": c.settings,
-        "Tested, not in the model": {name: _tested_words(effect) for name, effect in c.effects.items()},
-        "Versions": c.versions,
-        "Wall time [s]": {k: f"{v:.2f}" for k, v in c.timings.items()},
-        "Rates [Hz]": {k: f"{v:.4g}" for k, v in c.rates.items()},
+        ("Settings of the rig file", "name"): c.settings,
+        ("Tested, not in the model", "effect"): {name: _tested_words(effect) for name, effect in c.effects.items()},
+        ("Versions", "package"): c.versions,
+        ("Wall time [s]", "stage"): {k: f"{v:.2f}" for k, v in c.timings.items()},
+        ("Rates [Hz]", "sensor"): {k: f"{v:.4g}" for k, v in c.rates.items()},
     }
 
 
@@ -489,7 +498,8 @@ def _tested_words(effect: dict[str, Any]) -> str:
     off = [abs(v) / s for v, s in zip(effect["value"], effect["std"], strict=True)]
     k = off.index(max(off))
     label = f"{effect['labels'][k]} " if len(off) > 1 else ""
-    return f"{label}{effect['value'][k]:.2g} ± {effect['std'][k]:.2g} {effect['unit']}"
+    unit, scale = display_unit(effect["unit"])
+    return f"{label}{scale * effect['value'][k]:.2g} ± {scale * effect['std'][k]:.2g} {unit}"
 
 
 def size_words(c: Calibration) -> str:

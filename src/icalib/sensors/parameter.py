@@ -184,14 +184,14 @@ class ParameterSpec:
     file. prior_sigma: standard deviation of an initial guess, in `unit`, if the rig file states none.
 
     is_positive: a length or a factor above 0, whose changes are shown in percent. one: singular of `name`, if that is a
-    plural. is_auxiliary: estimated beside the calibration, such as edge bloom, and without a verdict; `meaning`
-    explains it. is_effect: zero of an ideal sensor; where the rig file gives no value, whether it is zero is tested.
-    is_considered: all standard deviations then include the response to it, as far as prior and data let it differ from
-    zero. starts_at_zero: needs no guess. largest: absolute value that the rig file may state, in `unit`; larger ones
-    were meant in another. least: smallest value that a sensor can have. by_images: determined by images, not by motion.
-    motion: advice if the data do not determine the group; {axes} stands for the axes about which the rig hardly turned.
-    motion_on_wheels, motion_without_target and motion_at_rest replace `motion` for rigs on wheels, without target, and
-    where nothing connects the instants.
+    plural, with which names of numbers begin. is_auxiliary: estimated beside the calibration, such as edge bloom, and
+    without a verdict. meaning: what pages say of it. is_effect: zero of an ideal sensor; where the rig file gives no
+    value, whether it is zero is tested. is_considered: all standard deviations then include the response to it, as far
+    as prior and data let it differ from zero. starts_at_zero: needs no guess. largest: absolute value that the rig file
+    may state, in `unit`; larger ones were meant in another. least: smallest value that a sensor can have. by_images:
+    determined by images, not by motion. motion: advice if the data do not determine the group; {axes} stands for the
+    axes about which the rig hardly turned. motion_on_wheels, motion_without_target and motion_at_rest replace `motion`
+    for rigs on wheels, without target, and where nothing connects the instants.
     """
 
     name: str

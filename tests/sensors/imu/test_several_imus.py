@@ -87,6 +87,7 @@ def test_each_axis_of_an_accelerometer_at_a_place_of_its_own(body):
     )
     found = calibrate_measurements(rig, simulation.measurements)
     np.testing.assert_allclose(found.group("imu1", "size_effect").value, SIZE, rtol=0, atol=1e-5)
+    assert found.value("imu1", "size_effect_yx") == found.group("imu1", "size_effect").value[0]
     if not body:
         assert np.abs(errors(found, simulation, "imu1")["translation"]).max() < 1e-5
         assert "scale-misalignment-size-effect" in export(found, "kalibr").files["imu.yaml"]
@@ -103,6 +104,8 @@ def test_axes_at_different_places_are_named_where_the_rig_file_has_them_at_one(a
     assert [w.split(" of ")[2].split()[0] for w in said] == (["imu1"] if apart_m else [])
     value, std = (np.array(found.effects["imu1.size_effect"][name]) for name in ("value", "std"))
     assert (np.abs(value - [0.0, apart_m, 0.0, 0.0, 0.0, -apart_m]) < 4.0 * std).all()
+    farthest = f"{1e3 * float(np.linalg.norm(value[:3] - value[3:])):.2g} mm apart"  # y and z, across the x axis
+    assert all(farthest in sentence for sentence in said)
 
 
 def test_errors_are_within_standard_deviations_and_residuals_as_stated(result, recorded):

@@ -274,8 +274,8 @@ def test_values_of_camera_info(draft, bags, model, D, expected, guess):
     ("topic", "size", "values", "words"),
     [
         ("/cam0/image_raw", SIZE, (0.0, 0.0, 0.0, 0.0), "/cam0/camera_info holds no intrinsics"),
-        ("/cam0/image_raw", (64, 48), K, "/cam0/camera_info is for 64 x 48 px and is not used"),
-        ("/cam0/image_rect", SIZE, K, "is for the unrectified images"),
+        ("/cam0/image_raw", (64, 48), K, "values of /cam0/camera_info are for 64 x 48 px and are not used"),
+        ("/cam0/image_rect", SIZE, K, "are for the unrectified images and are not used"),
     ],
 )
 def test_camera_info_that_is_not_used(draft, bags, topic, size, values, words):

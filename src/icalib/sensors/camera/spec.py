@@ -75,6 +75,7 @@ READOUT = ParameterSpec(
     is_effect=True,
     starts_at_zero=True,
     largest=0.5,
+    meaning="time from the first row of an image to the one after the last",
     motion="turn the rig faster, with points in all rows of the image",
 )
 LENS = (INTRINSICS.name, DISTORTION.name)  # parameter groups of the camera model

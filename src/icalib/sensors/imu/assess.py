@@ -117,7 +117,8 @@ def _effect_causes(e: Effect) -> Iterator[Cause]:
     value = float(e.value[0])
     if e.spec is SIZE_EFFECT:
         # No second estimate with it: translations would refer to another point, the x axis, without being asked.
-        apart = 1e3 * float(np.linalg.norm(e.value.reshape(2, 3), axis=1).max())
+        y, z = 1e3 * e.value.reshape(2, 3)  # mm; the x axis is at zero
+        apart = max(map(np.linalg.norm, (y, z, y - z)))
         sentence = (
             f"the axes of the accelerometer of {e.sensor} are not at one place, but up to {apart:.2g} mm apart. Write "
             "size_effect: free; translations then refer to its x axis."

@@ -77,10 +77,29 @@ INTRINSICS_LABELS = (
 N_INTRINSICS = len(INTRINSICS_LABELS)
 INTRINSICS = ParameterSpec("intrinsics", N_INTRINSICS, "nuisance", "", INTRINSICS_LABELS, 1e-2, 0.1, is_effect=True)
 SIZE_EFFECT = ParameterSpec(
-    "size_effect", 6, "nuisance", "m", ("yx", "yy", "yz", "zx", "zy", "zz"), 1e-3, 5e-3, is_effect=True, largest=1.0
+    name="size_effect",
+    size=6,
+    manifold="nuisance",
+    unit="m",
+    labels=("yx", "yy", "yz", "zx", "zy", "zz"),
+    tolerance=1e-3,
+    prior_sigma=5e-3,
+    one="size_effect",
+    is_effect=True,
+    largest=1.0,
+    meaning="places of the accelerometer's y and z axes relative to that of its x axis",
 )
 ACCEL_DELAY = ParameterSpec(
-    "accel_delay", 1, "nuisance", "s", ("accel_delay",), 1e-3, 1e-3, is_effect=True, largest=0.5
+    name="accel_delay",
+    size=1,
+    manifold="nuisance",
+    unit="s",
+    labels=("accel_delay",),
+    tolerance=1e-3,
+    prior_sigma=1e-3,
+    is_effect=True,
+    largest=0.5,
+    meaning="how long before its stamps the accelerometer measures",
 )
 LOW_PASS = ParameterSpec(
     name="low_pass",
@@ -94,7 +113,7 @@ LOW_PASS = ParameterSpec(
     is_auxiliary=True,
     is_effect=True,
     is_considered=True,
-    meaning="half the variance of the response of the IMU's filter",
+    meaning="low-pass filter of the IMU, as half the variance of its response",
 )
 # Effects on the readings, see `motion.imu_data`; none is in the model unless the rig file has it.
 EFFECTS = (SIZE_EFFECT, ACCEL_DELAY, LOW_PASS)

@@ -355,7 +355,9 @@ def lens_start(
         why = "for lenses of up to about 100 deg; for a fisheye: pinhole-equidistant"
         if (view := inspection.facts[name].view) is not None and view.model is not None:
             errors = ", ".join(f"{model} {error:.2g}" for model, error in view.errors_px.items())
-            return LensStart(view.model, f"fits the corners best, RMS [px]: {errors}", notes=tuple(notes))
+            is_best = view.errors_px[view.model] == min(view.errors_px.values())
+            fit = "fits the corners best" if is_best else "fits the corners about as well as the other"
+            return LensStart(view.model, f"{fit}, RMS [px]: {errors}", notes=tuple(notes))
         return LensStart(DEFAULT_MODEL, why, notes=tuple(notes))
     return _from_info(info, camera, camera.info.name, resolution, notes)
 
@@ -368,11 +370,11 @@ def _from_info(
     K = info.K
     intrinsics = (K[0, 0], K[1, 1], K[0, 2], K[1, 2])
     if camera.images is not None and "rect" in camera.images.name.lower():
-        notes.append(f"{topic} is for the unrectified images and is not used; prefer the raw images")
+        notes.append(f"values of {topic} are for the unrectified images and are not used; prefer the raw images")
     elif not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
         notes.append(f"{topic} holds no intrinsics")
     elif info.resolution != resolution:
-        notes.append(f"{topic} is for {_size(info.resolution)} px and is not used")
+        notes.append(f"values of {topic} are for {_size(info.resolution)} px and are not used")
     else:
         distortion = _distortion(info, model)
         if distortion is None:
