@@ -9,6 +9,7 @@ import json
 import platform
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from importlib.metadata import version
 from math import isnan
 from pathlib import Path
@@ -45,6 +46,7 @@ from icalib.sensors.camera.stream import CornerResiduals, TrackResiduals
 from icalib.sensors.imu.stream import ImuResiduals
 from icalib.sensors.lidar.stream import LidarResiduals
 from icalib.sensors.parameter import Parameter
+from icalib.sensors.position.stream import PositionResiduals
 from icalib.sensors.sensor import MOUNTED_NAMES, ROTATION, TRANSLATION
 from icalib.sensors.stream import Residuals, RowResiduals
 
@@ -208,11 +210,13 @@ def _residuals(plain: dict[str, Any], of: Callable[[type, str], dict[str, Any]])
     `RowResiduals`. `of` returns the arrays of a class under a prefix."""
     classes = {record.kind: record for record in RECORDS}
     fields = _tuples(plain)
-    record = classes.get(fields["kind"], RowResiduals)
-    arrays = of(record, f"residuals/{fields['sensor']}/{fields['kind']}")
-    if record is not RowResiduals:
-        del fields["kind"]  # a constant of the class, not an argument
-    return record(**fields, **arrays)
+    prefix = f"residuals/{fields['sensor']}/{fields['kind']}"
+    if fields["kind"] in classes:
+        record = classes[fields.pop("kind")]  # a constant of the class, not an argument
+        return record(**fields, **of(record, prefix))
+    with suppress(KeyError):  # earlier results have no fixes
+        return PositionResiduals(**fields, **of(PositionResiduals, prefix))
+    return RowResiduals(**fields, **of(RowResiduals, prefix))
 
 
 def _cross_validation(

@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 from tests.remarks import named, names
 from tests.sensors.position.test_position_runs import antenna, errors, recorded
+from tests.typed import instance
 
 from icalib.optim.state import State, make_layout
 from icalib.pipeline import calibrate_measurements
+from icalib.report import report_html
+from icalib.result import load_calibration
 from icalib.rig import Settings
 from icalib.sensors.position.residual import OffsetWalk, bursts_of, knot_entries, knot_keys, outliers_of
-from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.show import path_over_fixes
+from icalib.sensors.position.stream import PositionResiduals, PositionStream
 from icalib.tools.simulation import rig_for, simulate
 
 WALK = 0.02  # m/sqrt(s)
@@ -104,12 +110,50 @@ def test_a_slow_offset_that_is_not_modelled_is_named():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [11, *(pytest.param(k, marks=pytest.mark.full) for k in (13, 17))])
-def test_bursts_of_wrong_fixes_are_rejected(seed):
+def test_bursts_of_wrong_fixes_are_rejected(seed: int, tmp_path: Path, assert_drawn: Callable[[str, set[str]], None]):
     """A fifth of the fixes is off by metres, for 4 s on average."""
     error, std, _, result = walking(seed, 0.0, 0.0, bursts=0.2)
     assert (np.abs(error) < 4.0 * std).all()
     assert std[:3].max() < 0.015
     assert "outliers" in named("position_noise_used", result.notes)
+    (fixes,) = (r for r in result.residuals.values() if isinstance(r, PositionResiduals))
+    true = recorded("free", antenna(random_walk=0.0, bursts=0.2), seed=seed).truth.reported["gnss0"].position
+    path = fixes.position + fixes.residual
+    error, missed = (np.linalg.norm(x[:, None] - true, axis=2).min(axis=1) for x in (fixes.position, path))
+    assert error[fixes.rejected].min() > 0.2 and np.median(missed) < 0.02
+    drawn = {trace["name"]: trace for trace in path_over_fixes(fixes)["data"]}
+    (crosses,) = (trace for name, trace in drawn.items() if name.startswith(f"{fixes.rejected.sum()} rejected, by up"))
+    np.testing.assert_allclose(crosses["x"], fixes.position[fixes.rejected, 0], atol=1e-3)
+    assert len(fixes.normalised()["up"]) == (~fixes.rejected).sum() == len(fixes.successive()["up"].follows) + 1
+    result.save(tmp_path / "out")
+    loaded = load_calibration(tmp_path / "out")
+    again = instance(loaded.residuals["gnss0", "positions"], PositionResiduals)
+    np.testing.assert_array_equal(again.rejected, fixes.rejected)
+    page = report_html(loaded)
+    assert f"{(~fixes.rejected).sum()} fixes" in page and "Path over the fixes" in page
+    assert_drawn(page, {"map-0", "positions-0"})
+
+
+def test_the_path_over_the_fixes():
+    """A circle with a gap and a rejected fix 1 km away: the path is interrupted, and the axes end beside the circle."""
+    t = np.delete(0.2 * np.arange(100), range(40, 60))
+    circle = 1000.0 + 10.0 * np.stack([np.cos(t), np.sin(t), np.zeros(80)], axis=1)
+    error = np.zeros((80, 3))
+    error[7], error[30] = [0.0, 1000.0, 0.0], [0.3, 0.0, 0.0]
+    axes, rejected = ("east", "north", "up"), np.arange(80) == 7
+    given = "gnss0", "positions", axes, ("m", "m", "m"), t, -error, -error / 0.02, circle + error, rejected
+    figure = path_over_fixes(PositionResiduals(*given))
+    path, used, off, crosses = figure["data"]
+    assert [trace["name"] for trace in (used, off, crosses)] == [
+        "78 fixes",
+        "1 off by more than 3 sigma",
+        "1 rejected, by up to 1e+03 m",
+    ]
+    assert path["x"][40] is None and len(path["x"]) == 81
+    np.testing.assert_allclose([path["x"][:40], path["y"][:40]], circle[:40, :2].T, atol=1e-3)
+    assert crosses["y"] == [pytest.approx(circle[7, 1] + 1000.0, abs=1e-3)]
+    np.testing.assert_allclose(figure["layout"]["xaxis"]["range"], [989.0, 1011.0], atol=0.6)
+    assert figure["layout"]["xaxis"]["title"]["text"] == "east [m]"
 
 
 @pytest.mark.full

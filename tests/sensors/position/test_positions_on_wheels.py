@@ -15,6 +15,7 @@ from icalib.export.formats import write_outputs
 from icalib.pipeline import calibrate, calibrate_measurements
 from icalib.result import Calibration
 from icalib.rig import Ground, Parameter, Rig
+from icalib.sensors.position.show import sections
 from icalib.sensors.position.stream import PositionStream
 from icalib.sensors.wheels.simulate import SimWheels
 from icalib.tools.inspection import draft_rig, inspect_recording
@@ -111,6 +112,12 @@ def test_two_recordings():
     offset = sims[0].truth.time_offset["gnss0"] - sims[0].truth.time_offset["wheels0"]
     np.testing.assert_allclose(np.ravel(result.value("gnss0", "time_offset")) - offset, [0.0, -0.4], atol=0.015)
     np.testing.assert_allclose(result.value("gnss0", "translation")[:2], ON_WHEELS[:2], atol=0.05)
+    (maps,) = (section for section in sections(result) if section.name == "maps")
+    assert [plot.title for plot in maps.plots] == [f"gnss0 in {span.name}" for span in result.recordings]
+    true = sims[1].truth.reported["gnss0"].position
+    drawn = np.array([maps.plots[1].figure["data"][0][name] for name in "xy"]).T
+    near = np.linalg.norm(drawn[:, None] - true[:, :2], axis=2).min(axis=1)
+    assert len(drawn) > 0.9 * len(true) and np.sqrt(np.mean(near**2)) < 0.03
 
 
 def test_from_files_and_the_draft_of_their_rig(tmp_path):

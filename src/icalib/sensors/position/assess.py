@@ -11,14 +11,14 @@ from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, origin_difference
 from icalib.motion.factor import Whitened, pairs_of
 from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
-from icalib.result import RowResiduals, SensorFit
+from icalib.result import SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation, row_record
 from icalib.result.quantities import excess, times
 from icalib.rig import Rig
 from icalib.sensors.position.model import FIRST_NOISE_M
 from icalib.sensors.position.residual import SLOW_OFFSET, PositionFactor, PositionNoise, random_walk_of
 from icalib.sensors.position.spec import MESSAGES, PositionSensor
-from icalib.sensors.position.stream import PositionStream
+from icalib.sensors.position.stream import PositionResiduals, PositionStream
 
 # Correlation of successive residuals above which a warning is given: its value, and its value in standard errors. White
 # noise leaves 0 or less. At 0.1 the formal standard deviations of a lever arm were 1.4 times too small.
@@ -40,10 +40,11 @@ def assess(a: AssessedEstimate) -> Assessment:
     )
 
 
-def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[RowResiduals]:
+def residuals(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[PositionResiduals]:
     """Residuals of each position sensor, along the axes of its frame."""
     for factor, rows in pairs_of(estimate.problem.factors, estimate.outcome.residuals, PositionFactor):
-        yield row_record("positions", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
+        record = row_record("positions", factor.rows(rows, estimate.outcome.state), timeline, LABELS)
+        yield PositionResiduals(**vars(record), position=factor.position, rejected=~factor.used)
 
 
 def notes(inputs: Inputs, estimate: Estimate, timeline: Timeline) -> Iterator[Remark]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from icalib.sensors.stream import Stream, check
+from icalib.sensors.stream import RowResiduals, Shapes, Stream, Successive, check
 
 
 @dataclass(frozen=True)
@@ -43,3 +43,22 @@ class PositionStream(Stream):
         if not len(self.covariance):
             return np.tile(np.eye(3), (len(self.stamps_ns), 1, 1))
         return np.linalg.inv(np.linalg.cholesky(self.covariance))
+
+
+@dataclass(frozen=True)
+class PositionResiduals(RowResiduals):
+    """Residuals of n fixes along the axes of their frame. position (n, 3) m: the fixes in it; rejected (n,) bool:
+    outliers, without weight in the estimate."""
+
+    shapes: ClassVar[Shapes] = RowResiduals.shapes | {"position": ("f", "n", 3), "rejected": ("b", "n")}
+
+    position: np.ndarray
+    rejected: np.ndarray
+
+    def normalised(self) -> dict[str, np.ndarray]:
+        return {label: self.whitened[~self.rejected, k] for k, label in enumerate(self.labels)}
+
+    def successive(self) -> dict[str, Successive]:
+        used = np.flatnonzero(~self.rejected)
+        follows = np.diff(used) == 1
+        return {label: Successive(self.whitened[used, k : k + 1], follows) for k, label in enumerate(self.labels)}
