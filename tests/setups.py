@@ -73,6 +73,7 @@ TOLERANCE = {
     "frame_offset": 5e-3,
     "size": 1e-2,
     "scale": 1e-2,
+    "position_rotation": 2e-3,
 }
 PAPER = Path(__file__).parents[1] / "examples" / "paper"
 FEWEST_POINTS = 200  # of a plane in a setup

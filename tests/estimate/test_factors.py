@@ -624,7 +624,8 @@ def with_poses(setup, starts):
     are constant, as in `with_wheels`."""
     rng = np.random.default_rng(6)
     mount = {"rotation": so3.exp(rng.normal(size=3)), "translation": rng.normal(size=3), "time_offset": np.zeros(1)}
-    mount |= {"scale": np.array([1.03]), "clock_rate": np.array([70.0])}
+    mount |= {"scale": np.array([1.03]), "position_rotation": np.array([0.4, -0.2, 0.5])}
+    mount |= {"clock_rate": np.array([70.0])}
     entries = [(b.sensor, b.name, b.kind, b.size, b.start is not None) for b in setup.layout.blocks]
     entries += [("mocap0", k, "rotation" if k == "rotation" else "vector", len(v), True) for k, v in mount.items()]
     values = (
@@ -667,6 +668,9 @@ def pose_sample(
     return row_sample(setup, state, made, loss if curved else "none", curved)
 
 
+POSITIONS_HAVE = ("translation", "time_offset", "clock_rate")
+
+
 def position_sample(
     unlike, setup_of, imu_free=False, frame="frame_yaw", loss="none", curved=False, starts=(0,), restarts=False,
     stated=True, density=0.0, increments=False,
@@ -675,7 +679,7 @@ def position_sample(
     `stated`; the frame is levelled, turned anyhow, or that of the target. density: of their slow offset, or 0, and
     every fourth fix is then an outlier; `increments`: the factor of this offset."""
     setup = with_poses(setup_of(unlike, imu_free=imu_free), starts)
-    blocks = [b for b in setup.layout.blocks if b.key not in (("mocap0", "rotation"), ("mocap0", "scale"))]
+    blocks = [b for b in setup.layout.blocks if b.sensor != "mocap0" or b.name in POSITIONS_HAVE]
     values = dict(setup.state.values)
     entries = []
     for b in blocks:

@@ -15,11 +15,12 @@ from tests.remarks import remark
 
 from icalib.cli import main
 from icalib.cli.console import print_result, print_warnings
+from icalib.observability.prior_sensitivity import Effect
 from icalib.report import report_html
 from icalib.result import Calibration, load_calibration, relative_pose, verdict
 from icalib.result.quantities import rows
 from icalib.result.verdict import EXIT_CODES, NEXT, component_verdict, lens_projection_px
-from icalib.sensors.imu.spec import class_imperfections
+from icalib.sensors.imu.spec import ACCEL_DELAY, class_imperfections
 from icalib.validation.assess import unseen_notes
 
 LARGE = remark("it is too large.")
@@ -154,12 +155,19 @@ def test_what_makes_up_most_of_a_standard_deviation_is_noted(calibration: Calibr
     g = calibration.group("cam0", "time_offset")
     std = 1e3 * g.std[0]
     most, less = (dataclasses.replace(g, std_by={"board0.size": share * g.std}) for share in (0.8, 0.7))
-    (note,) = unseen_notes([most, less])
+    (note,) = unseen_notes([most, less], [])
     assert (
         f"the size of board0, which makes up most of the standard deviation of cam0 time offset ({0.8 * std:.2g} of"
         in note
     )
-    assert not list(unseen_notes([less]))
+    assert not list(unseen_notes([less], []))
+
+
+def test_an_effect_that_makes_up_most_of_a_standard_deviation_is_noted(calibration: Calibration):
+    g = calibration.group("cam0", "time_offset")
+    delay = Effect("imu0", ACCEL_DELAY, np.array([1e-3]), np.array([[3e-4]]), 11.0, 0.5)
+    (note,) = unseen_notes([dataclasses.replace(g, std_by={"imu0.accel_delay": 0.8 * g.std})], [delay])
+    assert note.startswith("the accel delay of imu0 may differ from zero")
 
 
 def test_a_lens_is_judged_by_its_projection(calibration: Calibration):

@@ -105,8 +105,7 @@ class Assessor(Generic[S]):
 
     assess: what it says of the estimate. misfit: on residuals larger than stated, or None; the last argument tells
     whether they are white and constant over the recording. keyframe_instants: stream key and instants of measurements
-    that keyframes may lie at. inner_contradictions: of measurements of one sensor, each with a change (B,) that
-    standard deviations cover.
+    that keyframes may lie at.
 
     length: what shows the metric scale, or None. sizes: names of parameters that do so if they are stated. absurd: on
     impossible estimates. is_far_guess: whether the guess of a group is contradicted; None if there is no test.
@@ -116,9 +115,6 @@ class Assessor(Generic[S]):
     assess: Callable[[AssessedEstimate], Assessment]
     misfit: Callable[[S, SensorFit, bool], Remark | None]
     keyframe_instants: Callable[[Inputs, State], Iterable[tuple[str, np.ndarray]]] = lambda *_: ()
-    inner_contradictions: Callable[[Inputs, Estimate, Segments | None], Iterable[tuple[Remark | None, np.ndarray]]] = (
-        lambda *_: ()
-    )
     length: Callable[[S, Rig], str | None] = lambda *_: None
     sizes: Callable[[S], Sequence[str]] = lambda _: ()
     absurd: Callable[[S, Groups], Remarks] = lambda *_: ()

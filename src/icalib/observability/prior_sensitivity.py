@@ -11,7 +11,7 @@ estimate leaves out.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 from scipy.linalg import eigh
 
 from icalib.errors import EstimationError
@@ -404,24 +405,34 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 
 # standard deviations from which an effect differs from zero; of several numbers: the same chance
 EFFECT_SIGMAS = SIGNIFICANT**0.5
+COVERED_SIGMAS = 2.5  # from which on standard deviations cover an effect: chance exceeds them in 1 of 80
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
 @dataclass(frozen=True)
 class Effect:
     """An effect of the whole recording, such as the rate of a clock, by a score test. value (m,): one Newton step of
-    its parameters [the unit of `spec`], beside all other effects that were tested; std (m,): its standard deviations,
-    by the scatter of segments after this step where an effect is suspected. chi2: of the step, with this covariance, 0
-    if there are no segments; gain: decrease of chi^2 where it is estimated, for white noise. moves: the largest change
-    of a parameter of the estimate by this effect alone, in tolerances."""
+    its parameters [the unit of `spec`], beside all other effects that were tested; root (m, n): of its covariance, by
+    the scatter of segments after this step where an effect is suspected. gain: decrease of
+    chi^2 where it is estimated, for white noise. moves: the largest change of a parameter of the estimate by this
+    effect alone, in tolerances."""
 
     sensor: str
     spec: ParameterSpec
     value: np.ndarray
-    std: np.ndarray
-    chi2: float
+    root: np.ndarray
     gain: float
     moves: float
+
+    @property
+    def std(self) -> np.ndarray:
+        """(m,) standard deviations."""
+        return np.sqrt((self.root**2).sum(axis=1))
+
+    @property
+    def chi2(self) -> float:
+        """Of the step."""
+        return _chi2(self.value, self.root)
 
     @property
     def differs(self) -> bool:
@@ -470,7 +481,9 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     rates = [problem.layout.columns(*key) for key, spec in specs.items() if spec is CLOCK_RATE]
     fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
     beside = replace(problem, fixed_directions=fixed), state
-    return EffectsLeftOut(freed_estimate.effects(specs, freed), freed_estimate.considered(specs), beside)
+    effects = freed_estimate.effects(specs, freed)
+    shifts = freed_estimate.covered(effects) | freed_estimate.considered(specs)
+    return EffectsLeftOut(effects, shifts, beside)
 
 
 def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
@@ -514,19 +527,24 @@ class _FreedEstimate:
     residuals: Residuals
 
     def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[Effect, ...]:
-        """All of the effects `specs`, at one Newton step."""
+        """All of the effects `specs`, at one Newton step; none without segments, if one may differ from zero."""
         step, root = self._step_of(np.arange(self.problem.layout.size))
         columns = {key: self.problem.layout.columns(*key) for key in specs}
-        gain = {key: _chi2(step[k], root[k]) for key, k in columns.items()}
-        suspected = any(gain[key] > least_chi2(len(k)) for key, k in columns.items())
+        suspected = any(_is_far(step[k], root[k]) for k in columns.values())
         ratio = self._scatter(step, root, freed) if suspected else np.ones(len(step))
-        std = np.sqrt((root**2).sum(axis=1)) * (np.ones(len(step)) if ratio is None else ratio)
+        if ratio is None:
+            return ()
         out = []
         for key, k in columns.items():
-            chi2 = 0.0 if ratio is None else _chi2(step[k] / ratio[k], root[k])
             moves = float(np.abs(self._response(k) @ step[k] / self._tolerance).max(initial=0.0))
-            out.append(Effect(key[0], specs[key], step[k], std[k], chi2, gain[key], moves))
+            out.append(Effect(key[0], specs[key], step[k], ratio[k, None] * root[k], _chi2(step[k], root[k]), moves))
         return tuple(out)
+
+    def covered(self, effects: Sequence[Effect]) -> dict[Key, np.ndarray]:
+        """(B,) changes of the calibration parameters by each effect that may differ from zero."""
+        columns = self.problem.layout.columns
+        far = (e for e in effects if _is_far(e.value, e.root))
+        return {(e.sensor, e.spec.name): self._response(columns(e.sensor, e.spec.name)) @ e.value for e in far}
 
     def considered(self, specs: Mapping[Key, ParameterSpec]) -> dict[Key, np.ndarray]:
         """(B,) responses of the calibration parameters to effects that are considered (Schmidt 1966). Each is as
@@ -578,6 +596,14 @@ class _FreedEstimate:
         np.divide(scattered, variance, out=ratio, where=variance > 0.0)  # 0: fixed
         ratio = np.sqrt(np.maximum(ratio, 1.0))
         return np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))
+
+
+def _is_far(step: np.ndarray, root: np.ndarray) -> bool:
+    """Whether `step` (m,), whose covariance has the root (m, n), differs from zero by COVERED_SIGMAS along a principal
+    direction; of several by what is as unlikely."""
+    values, vectors = np.linalg.eigh(root @ root.T)
+    least = special.chdtri(1, special.chdtrc(1, COVERED_SIGMAS**2) / len(step))
+    return bool(((vectors.T @ step) ** 2 > least * np.maximum(values, 1e-12 * values[-1])).any())
 
 
 def _chi2(step: np.ndarray, root: np.ndarray) -> float:

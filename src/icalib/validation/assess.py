@@ -31,7 +31,7 @@ from icalib.motion.poses import PPM
 from icalib.observability.assessor import AssessedEstimate, Remedy, assessments
 from icalib.observability.contradictions import Contradiction
 from icalib.observability.determination import Determined, Observability, RecordingTraits, observe
-from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, effects_left_out
+from icalib.observability.prior_sensitivity import EFFECT_SIGMAS, Effect, effects_left_out
 from icalib.optim.arrowhead import restricted_inverse
 from icalib.optim.state import Block, Key, State
 from icalib.result import (
@@ -67,10 +67,7 @@ def assess(
     estimate, rig = determined.estimate, inputs.rig
     left_out = effects_left_out(inputs, estimate)  # first, as it needs much memory for a moment
     segments = Segments.of(estimate.problem, estimate.outcome, rig.settings.segments)
-    contradicting = tuple(x for a in assessors().values() for x in a.inner_contradictions(inputs, estimate, segments))
-    changes = [change for _, change in contradicting]
-    shifts = [determined.shifts, *left_out.shifts.values(), *changes]
-    determined = dataclasses.replace(determined, shifts=np.vstack(shifts))
+    determined = dataclasses.replace(determined, shifts=np.vstack([determined.shifts, *left_out.shifts.values()]))
     observability = _observed(inputs, determined, _column_names(inputs))
     variances = VarianceParts.of(determined, segments)
     unseen = {key: shift**2 for key, shift in left_out.shifts.items()}
@@ -89,7 +86,6 @@ def assess(
     warnings = (
         *grave,
         *(c.sentence for c in causes if not c.grave),
-        *(sentence for sentence, _ in contradicting if sentence),
         *_warnings(assessed),
         *scatter_warnings(factors, segments is not None, validation),
     )
@@ -353,7 +349,7 @@ def notes(assessed: AssessedEstimate) -> Iterator[Remark]:
         yield Remark("recording_span", f"{name}: {timed if m.has_clock else f'{len(m.reference.stamps_ns)} images'}.")
     yield from assessed.inputs.measurements.notes
     yield from _clock_rate_notes(assessed)
-    yield from unseen_notes(assessed.groups)
+    yield from unseen_notes(assessed.groups, assessed.effects)
     for assessment in assessments(assessed):
         yield from assessment.notes
 
@@ -377,9 +373,9 @@ def _clock_rate_notes(assessed: AssessedEstimate) -> Iterator[Remark]:
 MOST_OF_VARIANCE = 0.5  # share from which on a note names its source
 
 
-def unseen_notes(groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
+def unseen_notes(groups: Sequence[ParameterGroup], effects: Sequence[Effect]) -> Iterator[Remark]:
     """A note on each nuisance parameter or effect that makes up most of the variance of a value."""
-    named = dict[str, list[str]]()
+    named, left_out = dict[str, list[str]](), {f"{e.sensor}.{e.spec.name}": e for e in effects}
     for g in groups:
         unit, scale = display_unit(g.unit)
         for source, part in g.std_by.items() if g.mode != "prior" and g.name not in AUXILIARY else ():
@@ -388,11 +384,13 @@ def unseen_notes(groups: Sequence[ParameterGroup]) -> Iterator[Remark]:
                 named.setdefault(source, []).append(f"{component_name(g, g.labels[k])} ({size})")
     for source, values in named.items():
         sensor, name = source.split(".")
-        yield Remark(
-            "std_from_prior",
-            f"the recording hardly shows the {name.replace('_', ' ')} of {sensor}, which makes up most of the standard "
-            f"deviation of {named_few(values)}; state a smaller sigma where you know it better.",
-        )
+        what = f"the {name.replace('_', ' ')} of {sensor}"
+        share = f"makes up most of the standard deviation of {named_few(values)}"
+        if (e := left_out.get(source)) is None or e.spec.is_considered:
+            words = f"the recording hardly shows {what}, which {share}; state a smaller sigma where you know it better."
+            yield Remark("std_from_prior", words)
+        else:
+            yield Remark("std_from_effect", f"{what} may differ from zero, which {share}; let it be estimated.")
 
 
 # Two-fold cross-validation, in the form of the result.

@@ -10,23 +10,19 @@ import numpy as np
 from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, with_association
-from icalib.estimate.residual_statistics import Segments
-from icalib.estimate.score_test import LeftOut, score_test
 from icalib.motion.factor import Whitened, output_at, pairs_of
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
-from icalib.observability.contradictions import SIGMAS
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
 from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation
 from icalib.result.quantities import excess, times
 from icalib.rig import PoseSensor, Rig
 from icalib.sensors.pose.residual import POSE_KINDS, PoseFactor, PoseNoise, RelativePosesFactor
+from icalib.sensors.pose.spec import POSITION_ROTATION
 
 # Lag-one autocorrelation of residuals: a warning is given above the first value (absolute poses), or below minus the
 # second (relative poses). It is 0 for the assumed noise, and -0.5 for differences of poses with independent noise.
 MAX_LAG_ONE_CORRELATION, MAX_LAG_ONE_ANTICORRELATION = 0.5, 0.35
-# Standard deviations of a difference between rotations and positions that is covered: chance exceeds them in 1 of 80.
-COVERED_SIGMAS = 2.5
 
 
 def assess(a: AssessedEstimate) -> Assessment:
@@ -34,6 +30,7 @@ def assess(a: AssessedEstimate) -> Assessment:
     return Assessment(
         notes=notes(a.inputs, a.estimate, a.timeline),
         warnings=warnings(a.inputs, a.estimate),
+        causes=causes(a),
     )
 
 
@@ -62,38 +59,21 @@ def _source(given: float | None) -> str:
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
-def inner_contradictions(
-    inputs: Inputs, estimate: Estimate, segments: Segments | None
-) -> Iterator[tuple[Remark | None, np.ndarray]]:
-    """For each pose sensor whose positions are turned against its rotations: a sentence, None below SIGMAS, and the
-    change (B,) of the calibration parameters to the farther of two estimates: by its rotations, or by its positions."""
-    outcome = estimate.outcome
-    if segments is None or not outcome.converged:
-        return
-    for factor, _ in pairs_of(estimate.problem.factors, outcome.residuals, PoseFactor):
-        turn = score_test(segments, outcome, factor.with_turned_positions, 3, COVERED_SIGMAS)
-        if turn is None:
-            continue
-        relative, change = inputs.sensor(factor.name).kind == "relative", turn.change.copy()
-        columns = inputs.layout.columns(factor.name, "rotation")
-        if relative and columns.min() >= 0:
-            by_positions = change[columns] + turn.value
-            change[columns] = np.where(np.abs(by_positions) > np.abs(change[columns]), by_positions, change[columns])
-        yield _turned_words(factor.name, relative, turn) if turn.sigmas > SIGMAS else None, change
-
-
-def _turned_words(name: str, relative: bool, turn: LeftOut) -> Remark:
-    """A sentence on positions that are turned against rotations."""
-    what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
-    angle = float(np.linalg.norm(turn.value))
-    axis = ", ".join(f"{-x:.2f}" for x in turn.value / angle)
-    return Remark(
-        "rotations_contradict_positions",
-        f"rotations and {what} of {name} contradict each other: its {what} are turned by {np.rad2deg(angle):.2g} deg, "
-        f"{turn.sigmas:.0f} standard deviations, about the axis ({axis}) of its {axes}; the printed standard "
-        "deviations cover the difference. To rely on its rotations, state a position_noise ten times as large as "
-        "noted.",
-    )
+def causes(a: AssessedEstimate) -> Iterator[Cause]:
+    """A cause for each pose sensor whose positions are turned against its rotations. Relative poses turn displacements
+    in the axes of the sensor."""
+    for e in (e for e in a.effects if e.spec is POSITION_ROTATION and e.differs):
+        relative = a.inputs.sensor(e.sensor).kind == "relative"
+        what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
+        angle = float(np.linalg.norm(e.value))
+        axis = ", ".join(f"{x:.2f}" for x in e.value / angle)
+        sentence = (
+            f"rotations and {what} of {e.sensor} contradict each other: its {what} are turned by "
+            f"{np.rad2deg(angle):.2g} deg, {np.sqrt(e.chi2):.0f} standard deviations, about the axis ({axis}) of its "
+            f"{axes}; the printed standard deviations cover the difference. To rely on its rotations, state a "
+            "position_noise ten times as large as noted."
+        )
+        yield Cause(Remark("rotations_contradict_positions", sentence), e.gain)
 
 
 def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
@@ -174,4 +154,4 @@ def length(sensor: PoseSensor, rig: Rig) -> str | None:
     return f"the positions of {sensor.name}"
 
 
-ASSESSOR = Assessor(assess, misfit, inner_contradictions=inner_contradictions, length=length)
+ASSESSOR = Assessor(assess, misfit, length=length)

@@ -3,18 +3,19 @@
 `AbsolutePoseFactor`: each pose at its measurement time, in a frame that is static in each recording.
 `RelativePosesFactor`: relative poses over intervals that are close to those between keyframes; the frame may drift.
 
-Parameters of the sensor are rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, and scale (1,), the ratio
-of true to measured lengths. The frame of each recording has frame_rotation and frame_translation (R_world_frame,
-p_world_frame). Position residuals are predicted / scale - measured. With predicted - scale * measured instead, scale
-would multiply the noise, and the estimated scale would be too small.
+Parameters of the sensor are rotation, translation (R_imu_sensor, p_imu_sensor), time_offset, scale (1,), the ratio of
+true to measured lengths, and position_rotation (3,), by which positions are turned against rotations. The frame of
+each recording has frame_rotation and frame_translation (R_world_frame, p_world_frame). Position residuals are
+R predicted / scale - measured. With predicted - scale * measured instead, scale would multiply the noise, and the
+estimated scale would be too small.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -41,11 +42,13 @@ from icalib.motion.sensor_pose import Kinematics, SensorPose, rows_at
 from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import Rows
 from icalib.optim.state import Layout, State
+from icalib.sensors.pose.spec import POSE_SCALE, POSITION_ROTATION
 
 # Longest propagation from the nearest keyframe to a pose. Poses farther off are not used, as the noise of the
 # propagation is not modelled.
 MAX_POSE_PROPAGATION_S = 0.05
 POSE_KINDS = {"rotation": slice(0, 3), "position": slice(3, 6)}
+POSITION_ERRORS = (POSE_SCALE, POSITION_ROTATION)
 POSE_UNITS = {"rotation": "rad", "position": "m"}
 
 
@@ -72,12 +75,6 @@ class PoseFactor(RowFactor, ABC):
     position: np.ndarray
     noise: PoseNoise
 
-    def with_turned_positions(self, turn: np.ndarray) -> Self:
-        """The same measurements with all positions rotated by the vector `turn` (3,) [rad], about the origin of their
-        axes."""
-        factor: Any = self
-        return replace(factor, position=self.position @ so3.exp(turn).T)
-
     @property
     @abstractmethod
     def sigma(self) -> np.ndarray:
@@ -92,6 +89,11 @@ class PoseFactor(RowFactor, ABC):
     def kinds(self) -> dict[str, slice]:
         """See `Factor`."""
         return POSE_KINDS
+
+    @property
+    def position_columns(self) -> np.ndarray:
+        """(4,) calibration columns of the errors of positions, in the order of `POSITION_ERRORS`."""
+        return self.layout.columns(self.name, *(spec.name for spec in POSITION_ERRORS))
 
     def output(self) -> Whitened:
         """Empty arrays for `accumulate` to fill."""
@@ -198,12 +200,11 @@ class AbsolutePoseFactor(PoseFactor):
             at.position,
             Frame(v[frame, FRAME[0]], v[frame, FRAME[1]]),
             self.rotation[block],
-            v[self.name, "scale"][0] * self.position[block],
+            _true_positions(self, state, block),
             into.sums,
         )
         rows = _rows(residuals, (at,), self, state, block)
-        frame_columns = self.layout.columns(frame, *FRAME)
-        columns = [kinematics.columns(recording), frame_columns, self.layout.columns(self.name, "scale")]
+        columns = [kinematics.columns(recording), self.layout.columns(frame, *FRAME), self.position_columns]
         interval = rows.on_intervals(keyframe, self.n_keyframes)
         return add_rows(rows, block, interval, np.concatenate(columns), _noise(self, block), into)
 
@@ -273,29 +274,42 @@ class RelativePosesFactor(PoseFactor):
             (a.rotation, b.rotation),
             (a.position, b.position),
             self.rotation[block],
-            state.values[self.name, "scale"][0] * self.position[block],
+            _true_positions(self, state, block),
             into.sums,
         )
-        columns = np.append(kinematics.columns(clock), self.layout.columns(self.name, "scale"))
+        columns = np.append(kinematics.columns(clock), self.position_columns)
         rows = _rows(residuals, (a, b), self, state, block)
         return add_rows(rows, block, keyframe, columns, _noise(self, block), into)
+
+
+def _turn(factor: PoseFactor, state: State) -> np.ndarray:
+    """(3,) rotation vector of the positions against the rotations."""
+    return state.values.get((factor.name, POSITION_ROTATION.name), np.zeros(3))
+
+
+def _true_positions(factor: PoseFactor, state: State, block: slice) -> np.ndarray:
+    """(n, 3) the measured positions `block`, as they are without their errors [m]."""
+    scale, R = state.values[factor.name, POSE_SCALE.name][0], so3.exp(_turn(factor, state))
+    return scale * factor.position[block] @ R
 
 
 def _rows(
     residuals: PoseResiduals, ends: tuple[SensorPose, ...], factor: PoseFactor, state: State, block: slice
 ) -> Rows:
-    """Rows of predicted / scale - measured, from `residuals`, which are predicted - scale * measured. Their calibration
-    parameters are those of the poses at both `ends`, then frame and scale."""
-    scale, reported = float(state.values[factor.name, "scale"][0]), factor.position[block]
-    residuals.residual[:, 3:] /= scale
-    n = len(residuals.J_frame)
-    J_frame_scale = np.zeros((n, 6, residuals.J_frame.shape[2] + 1))
-    J_frame_scale[:, :, :-1] = residuals.J_frame
-    for J in (J_frame_scale, *residuals.J_pose):
-        J[:, 3:] /= scale
+    """Rows of R predicted / scale - measured, from `residuals`, which are predicted - R^T scale * measured. Their
+    calibration parameters are those of the poses at both `ends`, then frame and errors of positions."""
+    scale, turn = float(state.values[factor.name, POSE_SCALE.name][0]), _turn(factor, state)
+    to_measured, n = so3.exp(turn) / scale, len(residuals.J_frame)
+    residuals.residual[:, 3:] = residuals.residual[:, 3:] @ to_measured.T
+    J_further = np.zeros((n, 6, residuals.J_frame.shape[2] + 4))
+    J_further[:, :, :-4] = residuals.J_frame
+    for J in (J_further, *residuals.J_pose):
+        J[:, 3:] = to_measured @ J[:, 3:]
     if n:
-        J_frame_scale[:, 3:, -1] = -(residuals.residual[:, 3:] + reported) / scale
-    return rows_at(residuals.residual, residuals.J_pose, ends, J_frame_scale)
+        predicted = residuals.residual[:, 3:] + factor.position[block]
+        J_further[:, 3:, -4] = -predicted / scale
+        J_further[:, 3:, -3:] = -so3.hat_many(predicted) @ so3.right_jacobian(-turn)
+    return rows_at(residuals.residual, residuals.J_pose, ends, J_further)
 
 
 def _noise(factor: PoseFactor, block: slice) -> RobustNoise:

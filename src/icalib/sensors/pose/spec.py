@@ -21,7 +21,7 @@ from icalib.sensors.fields import (
     table_layout,
     topic_or_none,
 )
-from icalib.sensors.parameter import Parameter, ParameterSpec
+from icalib.sensors.parameter import AXES, Parameter, ParameterSpec
 from icalib.sensors.sensor import (
     CLOCK_RATE,
     MOUNTED,
@@ -49,6 +49,21 @@ _ROTATIONS = (
     *(f"{name}, {unit}" for name in THREE_NUMBERS for unit in ("degrees", "radians")),
 )
 POSE_SCALE = ParameterSpec("scale", 1, "nuisance", "", ("scale",), 1e-2, 0.1)  # ratio of true to reported lengths
+# Measured positions are those of the model, turned by this rotation vector: absolute ones in the frame, about its
+# origin, displacements in the axes of the sensor.
+POSITION_ROTATION = ParameterSpec(
+    name="position_rotation",
+    size=3,
+    manifold="nuisance",
+    unit="rad",
+    labels=AXES,
+    tolerance="rotation_tolerance_deg",
+    prior_sigma=0.1,
+    is_auxiliary=True,
+    is_effect=True,
+    largest=np.pi,
+    meaning="rotation of its positions against its rotations",
+)
 _FIELDS = (
     "path",
     "topic",
@@ -78,7 +93,7 @@ class PoseSensor(MountedSensor):
     noun: ClassVar[str] = "pose sensor"
     readings: ClassVar[str] = "poses"
     gives_motion: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, POSE_SCALE)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, POSE_SCALE, POSITION_ROTATION)
 
     path: str
     kind: PoseKind = "absolute"
@@ -92,6 +107,7 @@ class PoseSensor(MountedSensor):
     layout: TableLayout = PLAIN_TABLE
     inverted: bool = False  # whether the recorded poses are T_sensor_frame instead of T_frame_sensor
     frames: tuple[str, str] | None = None  # parent and child in a topic of transforms; None: the topic contains poses
+    position_rotation: Parameter = Parameter("fixed")
     scale_sigma: float = 0.001  # prior standard deviation of scale; 0: scale is fixed at 1
 
     @property
