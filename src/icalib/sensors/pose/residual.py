@@ -74,6 +74,7 @@ class PoseFactor(RowFactor, ABC):
     rotation: np.ndarray
     position: np.ndarray
     noise: PoseNoise
+    layout: Layout
 
     @property
     @abstractmethod
