@@ -140,7 +140,7 @@ class Kind:
     imu: bool
     effects: tuple[str, ...]
     lens: Literal["free", "fixed"] = "free"
-    instant_s: float = 5.3
+    instant_s: float | None = 5.3
 
 
 KINDS = {
@@ -152,7 +152,7 @@ KINDS = {
     "positions + IMU": Kind(positions_imu, True, ()),
     "wheels + poses + IMU": Kind(wheels_poses_imu, True, (*IMU_EFFECTS, SCALE)),
     "wheels + poses": Kind(wheels_poses_imu, False, (SCALE,)),
-    "camera + wheels": Kind(camera_wheels, False, (SIZE,), "fixed", 3.1),
+    "camera + wheels": Kind(camera_wheels, False, (SIZE,), "fixed", None),
 }
 
 
@@ -255,6 +255,7 @@ def row_of(kind: Kind, effect: str, times: float, seeds: Sequence[int]) -> Row:
 
 LEVELS = (3.0, 10.0, 30.0)  # standard deviations by which an effect moves the result
 AT_INSTANT, FOR_A_WHILE = np.inf, 0.5  # s
+UNSHOWN = 3.0  # standard deviations of the prior of a length that nothing else shows: the largest plausible size
 # Identifiers of sentences that name a cause; all others say that numbers are uncertain, or describe residuals.
 CAUSES = re.compile(
     r"clock_(drifts|rate_estimated|jumps)|imu_not_ideal|imu_noise_(under|over)stated|ranges_contradict|range_\w+_estimated"
@@ -332,12 +333,13 @@ def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
             (lambda s, x: replace(s, target_size=1.0 + x)),
             (lambda s, x: replace(s, T_world_board=_bumped(s.T_world_board, x))),
         )
-        yield Outside("target size", 1e-3, 0.05, "", "target_size_wrong|lengths_contradict", size)
+        yield Outside("target size", 1e-3, UNSHOWN * SIZE_SIGMA, "", "target_size_wrong|lengths_contradict", size)
         yield Outside("target moved", 1e-3, 0.3, "rad", "(target|board)\\w* mov|moves.*board", moved, AT_INSTANT)
     for lidar in scenario.of(SimLidar):
         yield from _of_lidar(lidar)
     for poses in scenario.of(SimPoses):
-        yield Outside("scale of poses", 1e-3, 0.01, "", "scale|lengths_", _with(poses.name, scale=lambda s, x: s + x))
+        scale = _with(poses.name, scale=lambda s, x: s + x)
+        yield Outside("scale of poses", 1e-3, UNSHOWN * PoseSensor.scale_sigma, "", "scale|lengths_", scale)
     for wheels in scenario.of(SimWheels):
         turned = _with(wheels.name, radii=lambda r, x: (r[0] * (1.0 + x), r[1]))
         yield Outside("left radius changes", 1e-3, 0.1, "", "wheel_sizes_change", turned, AT_INSTANT)
@@ -408,11 +410,13 @@ def _swapped_wheels(measured: Measurements) -> Measurements:
 
 def recorded(kind: Kind, effect: Outside, size: float, seed: int) -> tuple[Measurements, list[Simulation]]:
     """Measurements with an effect, and the simulations whose truths they have: both sides of one that begins."""
-    base, begin = kind.scenario(), kind.instant_s
+    base = kind.scenario()
     after = simulate(effect.changed(base, size), seed)
     if effect.lasts is None:
         return effect.streams(after.measurements), [after]
-    before, end = simulate(base, seed), begin + effect.lasts
+    before = simulate(base, seed)
+    begin = _middle_of_images(before) if kind.instant_s is None else kind.instant_s
+    end = begin + effect.lasts
     sides = [
         (before, -np.inf, begin),
         (after, begin, end),
@@ -424,6 +428,12 @@ def recorded(kind: Kind, effect: Outside, size: float, seed: int) -> tuple[Measu
         joined = type(stream).joined([part for part in parts if len(part.stamps_ns)])
         streams.append(replace(joined, joins_ns=()))
     return Measurements.of_streams(*streams), [before, after] if effect.lasts == AT_INSTANT else [before]
+
+
+def _middle_of_images(simulation: Simulation) -> float:
+    """The median instant of the images of the first camera, s on the IMU's clock."""
+    stamps, origin = simulation.measurements.cameras[0].stamps_ns, np.int64(simulation.truth.imu_clock_origin_ns)
+    return float(np.median((stamps - origin) * 1e-9))
 
 
 def _part(simulation: Simulation, key: str, low: float, high: float) -> Stream:

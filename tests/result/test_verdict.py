@@ -151,6 +151,15 @@ def test_the_prior_of_the_imu_is_named_before_motion_is_asked_for(calibration: C
     assert second.startswith("cam1 rotation x (std") and "record longer" in second
 
 
+def test_an_imu_that_may_not_be_ideal_is_no_prior(calibration: Calibration):
+    """Standard deviations cover intrinsics that the rig file fixes, and there is no prior to name."""
+    c = with_verdicts(calibration, "weak", ("rotation",))
+    by_imu = (dataclasses.replace(g, std_by={"imu0.intrinsics": 0.9 * g.std}) for g in c.groups)
+    sensors = c.rig["sensors"] | {"imu0": c.rig["sensors"]["imu0"] | {"intrinsics": "fixed"}}
+    (reason,) = dataclasses.replace(c, groups=tuple(by_imu), rig=c.rig | {"sensors": sensors}).reasons
+    assert reason.startswith("cam0 rotation x (std") and "record longer" in reason
+
+
 def test_what_makes_up_most_of_a_standard_deviation_is_noted(calibration: Calibration):
     g = calibration.group("cam0", "time_offset")
     std = 1e3 * g.std[0]

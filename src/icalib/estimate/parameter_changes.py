@@ -5,10 +5,11 @@ Score test of parameter constancy (Nyblom 1989; for a break, Chow 1960). The est
 parameters. In the test those of one group are x + d_g e in segment g. The pattern d_g is linear in time (drift), or 0
 before and 1 after a boundary (step). Near the optimum chi^2 is a quadratic form of the common step and of e, from
 which the trajectory of the whole recording is eliminated: that it goes on shows a jump. One solve gives e, its
-covariance, and the decrease of chi^2. A pulse, two segments that differ, is no change, but competes with them:
+covariance, and the decrease of chi^2. A pulse, a few segments that differ, is no change, but competes with them:
 one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
 the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
-Within a segment half of it is taken to have changed."""
+Within a segment half of it is taken to have changed. A step is tested again with short segments around it, as what
+half of a segment does not explain hides the rest."""
 
 from __future__ import annotations
 
@@ -35,6 +36,7 @@ Pattern = Literal["drift", "step", "pulse"]
 SIGNIFICANT = 25.0  # gain of one parameter, five standard deviations, as many instants are tried; of more: as unlikely
 LEAD = 9.0  # of gains of two patterns: three standard deviations
 INSTANTS = 16  # segments, at whose ends changes are tried
+SHORTER = 4  # parts of each segment around a change
 # Share that a change must gain of the gain by separate parameters for each segment. On EuRoC, where lens and board do
 # not follow the model, the best change gains 0.04.
 MIN_CHANGE_SHARE = 0.25
@@ -80,7 +82,7 @@ def least_chi2(m: int) -> float:
 
 @dataclass(frozen=True)
 class Scatter:
-    """What separate parameters for each pair of segments gain. gain: decrease of chi^2; dof: number of their
+    """What separate parameters for each segment gain. gain: decrease of chi^2; dof: number of their
     directions that are determined."""
 
     gain: float
@@ -100,7 +102,7 @@ class Scatter:
 
 class Changes(NamedTuple):
     """by_gain: the pattern with the largest gain for each candidate, sorted by decreasing gain; scatter: what separate
-    parameters for each pair of segments gain."""
+    parameters for each segment gain."""
 
     by_gain: tuple[Change, ...]
     scatter: Scatter
@@ -123,6 +125,25 @@ def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Change
     parts, candidates = Segments.cut(problem, state, INSTANTS), list(_candidates(problem, sensors))
     if parts is None or not candidates:
         return NO_CHANGES
+    found = _by_gain(parts, candidates)
+    best = found.by_gain[0]
+    if best.pattern == "drift" or best.gain < least_chi2(best.count):
+        return found
+    return _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates)
+
+
+def _shorter_around(second: float, parts: Segments) -> np.ndarray:
+    """(G + 1,) keyframes that bound segments: two of `parts` together, and parts of those next to an instant."""
+    seconds, ends = parts.state.seconds[parts.ends], parts.ends
+    at = int(np.searchsorted(seconds, second)) - 1  # the segment in which the instant is, or at whose end
+    near = np.arange(max(at - 1, 0), min(at + 2, parts.count) + 1)
+    short = np.interp(np.arange(near[0], near[-1] + 1e-9, 1.0 / SHORTER), near, ends[near]).astype(np.int64)
+    far = np.setdiff1d(ends[::2], np.arange(short[0], short[-1] + 1))
+    return np.unique(np.concatenate([short, far, ends[[0, -1]], parts.problem.chain.starts]))
+
+
+def _by_gain(parts: Segments, candidates: Sequence[Candidate]) -> Changes:
+    """The best change of each candidate, and the scatter of the segments."""
     form = _Form.of(parts, np.flatnonzero(np.any([c.directions.any(axis=1) for c in candidates], axis=0)))
     best_changes = []
     for candidate in candidates:
@@ -168,8 +189,9 @@ def _patterns(ends: np.ndarray) -> Iterator[tuple[Pattern, float, np.ndarray]]:
     yield "drift", float(centre), (middle - centre) / (ends[-1] - ends[0])
     for second in np.sort([*ends[1:-1], *middle[1:-1]]):  # within a segment about half of it changes
         yield "step", float(second), np.heaviside(middle - second, 0.5)
-    for k in range(len(middle) - 1):
-        yield "pulse", float(ends[k + 1]), np.isin(np.arange(len(middle)), (k, k + 1)).astype(np.float64)
+    for n in range(2, SHORTER + 1):
+        for k in range(len(middle) - n + 1):
+            yield "pulse", float(np.mean(ends[[k, k + n]])), np.isin(np.arange(len(middle)), k + np.arange(n)) * 1.0
 
 
 class _Solved(NamedTuple):
@@ -226,9 +248,6 @@ class _Form:
         return _Solved.of(information, pattern @ self.gradient)
 
     def scatter(self) -> Scatter:
-        """What separate parameters for each pair of segments gain."""
-        pairs = np.arange(0, len(self.gradient), 2)
-        information = np.add.reduceat(np.add.reduceat(self.information, pairs, axis=0), pairs, axis=2)
-        gradient = np.add.reduceat(self.gradient, pairs, axis=0)
-        each = _Solved.of(information.reshape(gradient.size, -1), gradient.ravel())
+        """What separate parameters for each segment gain."""
+        each = _Solved.of(self.information.reshape(self.gradient.size, -1), self.gradient.ravel())
         return Scatter(each.gain, each.dof)

@@ -154,6 +154,11 @@ class Segments:
         ends = segment_ends(problem.chain.starts, problem.n_keyframes, count)
         if len(ends) < 3 or np.diff(ends).min() < fewest:
             return None
+        return cls.at(problem, state, ends)
+
+    @classmethod
+    def at(cls, problem: Problem, state: State, ends: np.ndarray) -> Segments:
+        """Segments bounded by the keyframes `ends` (G + 1,), without sums."""
         return cls(problem.cut(state, ends[:-1]), state, ends, *[np.zeros(0)] * 3)
 
     @property

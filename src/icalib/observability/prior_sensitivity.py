@@ -482,7 +482,7 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
     beside = replace(problem, fixed_directions=fixed), state
     effects = freed_estimate.effects(specs, freed)
-    shifts = freed_estimate.covered(effects) | freed_estimate.considered(specs)
+    shifts = freed_estimate.considered(specs) | freed_estimate.covered(effects)
     return EffectsLeftOut(effects, shifts, beside)
 
 

@@ -200,7 +200,9 @@ def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
                 yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0], False
             continue
         unit, scale = display_unit(g.unit)
-        by_imu = g.std_by.get(f"{c.imu}.intrinsics", np.zeros(len(g.std)))
+        by_imu = np.zeros(len(g.std))
+        if c.imu is not None and "sigma" in c.rig["sensors"][c.imu].get("intrinsics", ()):  # a prior, not `fixed`
+            by_imu = g.std_by.get(f"{c.imu}.intrinsics", by_imu)
         for label, verdict, std, part in zip(g.labels, verdicts, g.std.tolist(), by_imu.tolist(), strict=False):
             is_most = part**2 > _MOST_BY_IMU * std**2
             size = f"{scale * part:.2g} of {scale * std:.2g} {unit}" if is_most else f"std {scale * std:.2g} {unit}"
