@@ -125,10 +125,10 @@ def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Change
     parts, candidates = Segments.cut(problem, state, INSTANTS), list(_candidates(problem, sensors))
     if parts is None or not candidates:
         return NO_CHANGES
-    found = _by_gain(parts, candidates)
-    best = found.by_gain[0]
+    coarse = _by_gain(parts, candidates)
+    best = coarse.by_gain[0]
     if best.pattern == "drift" or best.gain < least_chi2(best.count):
-        return found
+        return coarse
     return _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates)
 
 
