@@ -57,7 +57,7 @@ def test_points_are_coloured_by_distance_and_the_outline_has_two_lines(calibrati
 def test_the_part_with_most_depth_edges_is_enlarged(calibration: Calibration):
     c = with_images(calibration)
     edge = np.array([[5.0, 4.0], [300.0, 200.0], [301.0, 210.0], [299.0, 190.0], [700.0, 470.0]])
-    points = replace(cloud(8), uv=np.vstack([edge, edge[:3]]), edge=np.arange(8) < 5)
+    points = PointsInImage(np.vstack([edge, edge[:3]]), np.full(8, 3.0), np.arange(8) < 5)
     corners, pair = c.pictures
     _, before, after = figures(replace(c, pictures=(corners, replace(pair, before=cloud(3), after=points))))
     assert before.window == after.window == (300.0 - 752 / 12, 200.0 - 480 / 12, 752 / 6, 480 / 6)
@@ -65,8 +65,8 @@ def test_the_part_with_most_depth_edges_is_enlarged(calibration: Calibration):
     found = report_html(replace(c, pictures=(replace(pair, before=None, after=points),)))
     assert found.count(f'<use href="#{after.name.replace("1", "0")}"/>') == 1
     assert 'viewBox="237.3 160.0 125.3 80.0"' in found
-    corner = replace(points, uv=np.full((8, 2), 2.0))
-    *_, after = figures(replace(c, pictures=(replace(pair, after=corner),)))
+    near = replace(points, distance=np.array([1.7, 3.0, 3.0, 3.0, 2.0, 1.0, 1.0, 1.0]))  # one point in the corner
+    *_, after = figures(replace(c, pictures=(replace(pair, after=near),)))
     assert after.window == (0.0, 0.0, 752 / 6, 480 / 6)
     *_, after = figures(replace(c, pictures=(replace(pair, after=replace(points, edge=np.zeros(8, bool))),)))
     assert after.window is None

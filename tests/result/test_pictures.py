@@ -21,6 +21,7 @@ from icalib.result.pictures import (
     Mount,
     cloud_in_image,
     depth_edges,
+    hidden,
     pictures,
     target_in_image,
 )
@@ -147,6 +148,19 @@ def test_depth_edges_are_the_sides_of_a_box_before_a_wall(rings, ring_deg):
     if ring_deg < 1.0:
         sides |= box & (abs(elevation) > np.deg2rad(5.84))
     np.testing.assert_array_equal(found.reshape(box.shape), sides)
+
+
+def test_points_behind_an_object_are_hidden_and_those_beside_it_are_not():
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(0.0, 200.0, 2.0), np.arange(0.0, 150.0, 12.0)))
+    wall, box = (
+        np.stack([u, v], axis=1),
+        np.stack([u, v + 3.0], axis=1)[(abs(u - 100.0) < 40.0) & (abs(v - 70.0) < 40.0)],
+    )
+    uv, distance = np.concatenate([wall, box]), np.repeat([6.0, 2.0], [len(wall), len(box)])
+    behind = (abs(wall - [100.0, 71.5]) < [36.0, 30.0]).all(axis=1)
+    beside = (abs(wall - [100.0, 71.5]) > [50.0, 60.0]).any(axis=1)
+    found = hidden(uv, distance)
+    assert found[: len(wall)][behind].all() and not found[: len(wall)][beside].any() and not found[len(wall) :].any()
 
 
 def test_the_outline_is_that_of_the_sheet_in_the_pose_that_the_camera_sees(moving):

@@ -183,7 +183,7 @@ _POINTS_WORDS = (
     "calibration colours change at the edges of objects. A wrong rotation shifts points in all images, a wrong time "
     "offset in those of fast turns. Points that an object hides from the camera are drawn, too. White dots are depth "
     f"edges: beside them the LiDAR sees something at least {100.0 * EDGE_STEP:.0f} % farther. The framed part, which "
-    "has most of them, is enlarged below. In a good calibration they lie along edges of the image."
+    "has most of them on near objects, is enlarged below. In a good calibration they lie along edges of the image."
 )
 _HISTOGRAM_WORDS = (
     "The distribution is a little narrower than normal where estimated parameters absorb part of the noise, most of "
@@ -210,7 +210,7 @@ def report_html(calibration: Calibration) -> str:
         trust=TRUST[c.verdict],
         grave={c.failure, *c.wrong, *c.unobservable},
         extrinsics=extrinsics(c),
-        lead=replace(drawn[-1], jpeg="", name="") if drawn else general["rig"].picture,
+        lead=replace(drawn[-1], jpeg="", name="", window=None) if drawn else general["rig"].picture,
         cards=sensor_cards(c),
         pairs=camera_pairs(c),
         drawings=drawn,

@@ -73,13 +73,13 @@ def figures(c: Calibration) -> Iterator[Drawing]:
 
 
 def window_of(points: PointsInImage, size: tuple[int, int]) -> tuple[float, float, float, float] | None:
-    """The part of an image of this size, 1 / ENLARGED as wide and high, that has most points on depth edges; None
-    without any."""
+    """The part of an image of this size, 1 / ENLARGED as wide and high, that has most points on depth edges of near
+    objects, whose solid angle counts; None without any. Far ones are small and crowded."""
     uv, (width, height) = points.uv[points.edge], np.array(size) / ENLARGED
     if not len(uv):
         return None
-    within = np.abs(uv[:, None] - uv) < [0.5 * width, 0.5 * height]
-    left, top = uv[int(np.argmax(within.all(axis=2).sum(axis=1)))] - [0.5 * width, 0.5 * height]
+    within = (np.abs(uv[:, None] - uv) < [0.5 * width, 0.5 * height]).all(axis=2)
+    left, top = uv[int(np.argmax(within @ points.distance[points.edge] ** -2.0))] - [0.5 * width, 0.5 * height]
     return float(np.clip(left, 0.0, size[0] - width)), float(np.clip(top, 0.0, size[1] - height)), width, height
 
 

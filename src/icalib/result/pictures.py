@@ -21,6 +21,7 @@ MOST_POINTS = 4000  # of a LiDAR in a picture: more hide one another, and each h
 MOST_EDGE_POINTS = 800  # the same of points on depth edges, which are drawn larger
 EDGE_STEP = 0.1  # share of the distance; a plane shows it between beams 0.2 deg apart if it is grazed by 2 deg
 EDGE_NEIGHBOURS, ALIKE = 4, 1.5  # beams on a grid have four at one angle, and the next at 1.41 times that
+AROUND, HIDING = 8, 2  # points: on the border of an object that hides another, half of those around are the nearer ones
 LEAST_POINTS = 100  # in the picture of a moving rig: fewer show no edge
 LONGEST_SCAN_S = 0.2  # of usual LiDARs (5 Hz); points of a picture are taken half of it before and after the image
 MOST_DISTANCE = 1e3  # m: farther points are none
@@ -83,10 +84,10 @@ def in_image(c: Calibration, camera: str, points: np.ndarray) -> tuple[np.ndarra
 def cloud_in_image(
     c: Calibration, path: CubicPath, camera: str, mounts: tuple[Mount, Mount], scans: ScanPoints, stamp_ns: int
 ) -> PointsInImage:
-    """Points of a LiDAR in the image of `camera` with this stamp, the farthest first; MOST_POINTS, and as many on depth
-    edges, at most. mounts: of the camera and of the LiDAR."""
+    """Points of a LiDAR in the image of `camera` with this stamp, the farthest first: MOST_POINTS, and MOST_EDGE_POINTS
+    on depth edges that are not hidden, at most. mounts: of the camera and of the LiDAR."""
     uv, distance, beams = _points_in_image(c, path, camera, mounts, scans, stamp_ns)
-    edge = depth_edges(beams)
+    edge = depth_edges(beams) & ~hidden(uv, distance)
     on_edges = np.flatnonzero(edge)
     some = np.union1d(_spread(len(uv), MOST_POINTS), on_edges[_spread(len(on_edges), MOST_EDGE_POINTS)])
     some = some[np.argsort(-distance[some])]
@@ -131,6 +132,15 @@ def depth_edges(beams: np.ndarray) -> np.ndarray:
     apart, at = map(np.asarray, KDTree(aim).query(aim, EDGE_NEIGHBOURS + 1))
     beside = apart[:, 1:] <= ALIKE * apart[:, 1:2]
     return (beside & (reach[at[:, 1:]] > (1.0 + EDGE_STEP) * reach[:, None])).any(axis=1)
+
+
+def hidden(uv: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(n,) bool: which points of a cloud in an image, uv (n, 2) px and distance (n,) m, something nearer hides from the
+    camera: HIDING of the points around each are nearer by EDGE_STEP."""
+    if len(uv) <= AROUND:
+        return np.zeros(len(uv), bool)
+    around = np.asarray(KDTree(uv).query(uv, AROUND + 1)[1])[:, 1:]
+    return ((1.0 + EDGE_STEP) * distance[around] < distance[:, None]).sum(axis=1) >= HIDING
 
 
 def _spread(count: int, most: int) -> np.ndarray:
