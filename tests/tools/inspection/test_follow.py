@@ -89,10 +89,10 @@ def test_a_bag_is_followed_in_time_with_half_a_core(filmed: Path, target: Path, 
     assert follower.problem == f"{path} is not there yet; start the recorder, or correct the path."
     begin, processor = time.monotonic(), time.process_time()
     for share in play(filmed, path, SECONDS):
-        worked = time.monotonic()
+        worked = time.process_time()
         follower.look()
         late.append(share * SECONDS - follower.seconds)
-        time.sleep(max(0.2, time.monotonic() - worked))
+        time.sleep(max(0.2, time.process_time() - worked))
     while follower.look():
         pass
     assert time.process_time() - processor < 0.5 * (time.monotonic() - begin)
@@ -168,6 +168,31 @@ def test_predictions_are_those_of_the_final_result():
     assert predict(CoarseProblem(rig, (part,), (every(corners[0], 40),), 2.0, 1.0, 36.0)).problem
 
 
+def test_between_solves_what_arrives_reduces_standard_deviations(target: Path):
+    f = follower_at(read_target(target), cam0=(50, 50))
+    weak = expected("rotation", "x", 0.002)
+    then = Expectation(10.0, (weak, replace(weak, std=np.inf)), progress=f.progress)
+    assert view(f, then).tables[1].rows[0][2] == "0.11, unknown" and then.stds_at(10.0, f.progress)[0].std == weak.std
+    f.topics["/cam0"].seen, f.motion.turning = 450, 4.0 * f.motion.turning  # 9 and 4 times as much
+    known, unknown = then.stds_at(40.0, f.progress)
+    assert known.std == pytest.approx(0.001) and known.needed_s == pytest.approx(0.0, abs=1e-9)
+    assert unknown.std == np.inf and unknown.needed_s == np.inf
+    f.motion.turning *= 0.5
+    known, _ = then.stds_at(20.0, f.progress)
+    assert known.needed_s == pytest.approx(20.0)  # the variance is twice that of the tolerance
+
+
+def test_a_problem_has_the_newest_parts(filmed: Path, target: Path):
+    follower = Follower(filmed, read_target(target))
+    while follower.look():
+        pass
+    follower._kept.appendleft(replace(follower._kept[0], seconds=30.0, corners={}))
+    follower.seconds += 30.0
+    whole, late = not_none(follower.coarse_problem()), not_none(follower.coarse_problem(SECONDS))
+    assert len(whole.parts) == len(late.parts) + 1 and late.progress == follower.progress
+    assert (whole.share, late.share) == (1.0, pytest.approx(SECONDS / (30.0 + SECONDS), rel=0.02))
+
+
 def follower_at(given: GivenTarget, **seen: tuple[int, int]) -> Follower:
     """A follower without a recording, with cameras and a motion about x and y of the IMU. seen: (searched, seen)."""
     f = Follower(Path("run.mcap"), given)
@@ -183,8 +208,8 @@ def follower_at(given: GivenTarget, **seen: tuple[int, int]) -> Follower:
     return f
 
 
-def expected(group: str, label: str, std: float, needed_s: float) -> ExpectedStd:
-    return ExpectedStd("cam0", group, label, "rad" if group == "rotation" else "s", std, 0.001, needed_s)
+def expected(group: str, label: str, std: float) -> ExpectedStd:
+    return ExpectedStd("cam0", group, label, "rad" if group == "rotation" else "s", std, 0.001, 10.0)
 
 
 def test_advice_names_the_axis_and_the_place_in_the_image(target: Path):
@@ -192,25 +217,25 @@ def test_advice_names_the_axis_and_the_place_in_the_image(target: Path):
     f = follower_at(given, cam0=(50, 50))
     assert view(f, None).advice[0] == "Keep moving: there is too little yet for a prediction."
     turned = {"cam0": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])}  # y of cam0 is z of imu0
-    weak = expected("rotation", "x", 0.002, 30.0)
+    weak = expected("rotation", "x", 0.002)
     now = view(f, Expectation(10.0, (weak,), turned))
     assert now.advice == (
         "Turn about the y axis of cam0, 30 s more, for its rotation x.",
         "Move the target into the left edge of the image of cam0.",
     )
     assert now.line.startswith("run.mcap, 0 s recorded: cam0 100 messages (100% with target), imu0 100 messages. Turn")
-    late = expected("time_offset", "time_offset", 0.004, np.inf)
+    late = expected("time_offset", "time_offset", np.inf)
     now = view(f, Expectation(10.0, (weak, late), turned, ("cam0: not determined by this motion; turn.",)))
     assert now.advice[:2] == (
         "cam0: not determined by this motion; turn.",
         "Turn and shake the rig faster, to and fro; cam0 needs it.",
     )
-    done = Expectation(12.0, (expected("rotation", "x", 0.0001, 0.0),), turned)
+    done = Expectation(12.0, (expected("rotation", "x", 0.0001),), turned)
     assert view(f, done).advice[0] == "All extrinsics and time offsets are determined after 12 s."
     table = view(f, Expectation(10.0, (weak, late), turned)).tables[1]
     assert table.rows == (
         ("cam0", "rotation", "0.11", "0.057", "deg", "30 s more"),
-        ("cam0", "time offset", "4", "1", "ms", "move otherwise"),
+        ("cam0", "time offset", "unknown", "1", "ms", "move otherwise"),
     )
     failed = Expectation(3.0, problem="too short.")
     assert view(f, failed).advice[:2] == (
@@ -272,8 +297,8 @@ def test_the_view_fits_the_terminal(width: int, height: int, target: Path):
     f = follower_at(read_target(target), cam0=(50, 50), a_camera_with_a_long_name=(9, 4))
     for k in range(9):
         f.topics[f"/robot/other/{k}"] = Arrivals(replace(f.sensors["imu0"], kind=""))
-    stds = [expected("rotation", axis, 0.002, 30.0) for axis in "xyz"]
-    stds += [replace(stds[0], sensor=f"camera{k}", needed_s=0.0) for k in range(9)]
+    stds = [expected("rotation", axis, 0.002) for axis in "xyz"]
+    stds += [replace(stds[0], sensor=f"camera{k}", std=0.0001) for k in range(9)]
     now = view(f, Expectation(10.0, tuple(stds), {"cam0": np.eye(3)}))
     console = Console(width=width, height=height, file=io.StringIO(), record=True)
     console.print(screen(now, width, height))
@@ -338,16 +363,16 @@ def test_a_solver_predicts_in_a_process_of_its_own(target: Path):
     try:
         deadline = time.monotonic() + 120.0
         while solver.latest is None and time.monotonic() < deadline:
-            solver.offer(lambda: problem)
+            solver.offer(lambda window_s: problem)
             time.sleep(0.1)
         assert solver.latest is not None and solver.latest.seconds == 7.0 and solver.latest.problem
         solver._is_idle, solver._free_at = True, np.inf
-        solver.offer(lambda: pytest.fail("it rests"))
+        solver.offer(lambda window_s: pytest.fail("it rests"))
         solver._process.kill()  # as for lack of memory
         solver._process.join()
         solver._free_at, solver.latest = 0.0, None
         while solver.latest is None and time.monotonic() < deadline:
-            solver.offer(lambda: problem)
+            solver.offer(lambda window_s: problem)
             time.sleep(0.1)
         assert solver.latest is not None
     finally:

@@ -1,7 +1,8 @@
 """Follows a recording that is being written: what has arrived, how good a calibration would be, and what to do next.
 
 What is new is read in small parts, each a recording of its own for the readers of all kinds. The last minutes are
-calibrated coarsely in a process of their own, over and over; standard deviations of the whole follow from that.
+calibrated coarsely in a process of their own, over and over; standard deviations of the whole follow from that, and
+until the next solve from what has arrived since.
 """
 
 from __future__ import annotations
@@ -52,7 +53,9 @@ from icalib.tools.inspection.console import GRID, Grid, Page, View, coverage, co
 from icalib.tools.inspection.facts import GivenTarget
 
 LOOK_EVERY_S = 0.2
-WINDOW_S = 120.0  # recorded time of a coarse problem; memory, and the time of a solve, are proportional to it
+WINDOW_S = 120.0  # longest recorded time of a coarse problem, which memory is proportional to
+SHORTEST_WINDOW_S = 20.0  # which most first guesses need
+SOLVE_S = 10.0  # processor time of a solve, by which the recorded time of a coarse problem is chosen
 SEARCH_HZ = 10.0  # images of a camera that are searched; standard deviations of all are extrapolated from these
 SEARCH_SHARE = 0.25  # of a core, at most, for the search of images
 SLOWEST_SEARCH_S = 0.5  # of an image, as far as SEARCH_SHARE counts it: the first one waits for its compiled code
@@ -69,7 +72,7 @@ class CoarseProblem:
     """What a solve needs. parts: of the last minutes, without images; corners: of the searched images of each camera.
 
     density: recorded images of the last minutes over those that were searched. share: recorded time of `parts` over
-    that of the whole recording, which lasts `seconds`.
+    that of the whole recording, which lasts `seconds`. progress: see `Follower`.
     """
 
     rig: Rig
@@ -78,13 +81,13 @@ class CoarseProblem:
     density: float
     share: float
     seconds: float
+    progress: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
 class ExpectedStd:
-    """Standard deviation of one number of a calibration, from all that is recorded so far. unit: SI; std: infinite if
-    the motion so far does not show it. needed_s: seconds more until `std` is `tolerance`, if the motion goes on; 0: it
-    is determined."""
+    """Standard deviation of one number of a calibration, from the first `seconds` of a recording. unit: SI; std:
+    infinite if the motion so far does not show it."""
 
     sensor: str
     group: str
@@ -92,20 +95,32 @@ class ExpectedStd:
     unit: str
     std: float
     tolerance: float
-    needed_s: float
+    seconds: float
+
+    @property
+    def needed_s(self) -> float:
+        """Seconds more until `std` is `tolerance`, if the motion goes on; 0: it is determined."""
+        return float(self.seconds * max((self.std / self.tolerance) ** 2 - 1.0, 0.0))
 
 
 @dataclass(frozen=True)
 class Expectation:
     """Outcome of a coarse problem. stds: of extrinsics, time offsets and lenses; rotations: R_imu_sensor of each
     sensor; hidden: sentences on combinations that the motion does not show; problem: why there is no outcome.
-    seconds: recorded time that it holds for."""
+    seconds, progress: recorded time that it holds for, and what was seen by then, as of `Follower`."""
 
     seconds: float
     stds: tuple[ExpectedStd, ...] = ()
     rotations: Mapping[str, np.ndarray] = field(default_factory=dict)
     hidden: tuple[str, ...] = ()
     problem: str = ""
+    progress: tuple[float, ...] = ()
+
+    def stds_at(self, seconds: float, progress: tuple[float, ...]) -> tuple[ExpectedStd, ...]:
+        """The standard deviations of a longer recording: variances fall as the least of its progress grows."""
+        growth = min((now / then for then, now in zip(self.progress, progress, strict=False) if then), default=1.0)
+        factor, seconds = float(np.sqrt(1.0 / growth)), max(seconds, self.seconds)
+        return tuple(replace(s, std=factor * s.std, seconds=seconds) for s in self.stds)
 
 
 def predict(problem: CoarseProblem) -> Expectation:
@@ -130,7 +145,8 @@ def predict(problem: CoarseProblem) -> Expectation:
     groups = [g for g in groups if g.name in (*MOUNTED_NAMES, "intrinsics") and g.unit and g.std_formal.all()]
     stds = [std for g in groups for std in _expected(problem, g, halved.group_or_none(g.sensor, g.name))]
     turned = {g.sensor: g.value for g in whole.groups if g.name == "rotation"}
-    return Expectation(problem.seconds, tuple(stds), turned, tuple(map(str, whole.unobservable)))
+    hidden = tuple(map(str, whole.unobservable))
+    return Expectation(problem.seconds, tuple(stds), turned, hidden, progress=problem.progress)
 
 
 def _expected(problem: CoarseProblem, g: ParameterGroup, halved: ParameterGroup | None) -> Iterator[ExpectedStd]:
@@ -145,11 +161,8 @@ def _expected(problem: CoarseProblem, g: ParameterGroup, halved: ParameterGroup 
     given = sensor.spec(g.name).tolerance
     tolerance = problem.rig.settings.tolerance(given) if isinstance(given, str) else given
     for k, t in enumerate(np.broadcast_to(tolerance, std.shape).tolist()):
-        is_observable = g.verdict[k] != "undetermined"
-        needed = problem.seconds * max((std[k] / t) ** 2 - 1.0, 0.0) if is_observable else np.inf
-        yield ExpectedStd(
-            g.sensor, g.name, g.labels[k], g.unit, float(std[k]) if is_observable else np.inf, t, float(needed)
-        )
+        size = float(std[k]) if g.verdict[k] != "unobservable" else np.inf
+        yield ExpectedStd(g.sensor, g.name, g.labels[k], g.unit, size, t, problem.seconds)
 
 
 def _measurements(problem: CoarseProblem, rig: Rig) -> Measurements:
@@ -181,10 +194,12 @@ def _work(pipe: Connection) -> None:
 
 
 class Solver:
-    """Solves coarse problems one at a time in a process of its own, with rests. latest: the last outcome."""
+    """Solves coarse problems one at a time in a process of its own, with rests. latest: the last outcome; window_s:
+    recorded time that the next problem should have at most, so that its solve takes SOLVE_S."""
 
     def __init__(self) -> None:
         self.latest: Expectation | None = None
+        self.window_s = WINDOW_S
         self._start()
 
     def _start(self) -> None:
@@ -193,18 +208,20 @@ class Solver:
         self._process = context.Process(target=_work, args=(end,), daemon=True)
         self._process.start()
         end.close()
-        self._is_idle, self._begun, self._free_at = False, time.monotonic(), 0.0
+        self._is_idle, self._begun, self._free_at, self._solved_s = False, time.monotonic(), 0.0, 0.0
 
-    def offer(self, make: Callable[[], CoarseProblem | None]) -> None:
+    def offer(self, make: Callable[[float], CoarseProblem | None]) -> None:
         """Takes the outcome of a solve that has ended, and begins one if it is time."""
         try:
             if not self._is_idle and self._pipe.poll():
                 self._is_idle = True
                 if (answer := self._pipe.recv()) is not None:  # None: the process is ready
-                    self.latest, took = answer
+                    took = answer[1] if self.latest else min(answer[1], SOLVE_S)  # the first one compiles its code
+                    self.latest = answer[0]
                     self._free_at = self._begun + took / SOLVE_SHARE
-            if self._is_idle and time.monotonic() >= self._free_at and (problem := make()) is not None:
-                self._begun, self._is_idle = time.monotonic(), False
+                    self.window_s = float(np.clip(self._solved_s * SOLVE_S / took, SHORTEST_WINDOW_S, WINDOW_S))
+            if self._is_idle and time.monotonic() >= self._free_at and (problem := make(self.window_s)) is not None:
+                self._begun, self._is_idle, self._solved_s = time.monotonic(), False, problem.share * problem.seconds
                 self._pipe.send(problem)
         except (EOFError, OSError):  # the process was killed, such as for lack of memory
             self.close()
@@ -474,15 +491,23 @@ class Follower:
         key = "targets" if isinstance(self.target, Scene) else "target"
         return rig_from_dict({"sensors": sensors, key: self.target.plain()}, str(self.root))
 
-    def coarse_problem(self) -> CoarseProblem | None:
-        """The problem of the last minutes; None while there is too little."""
+    @property
+    def progress(self) -> tuple[float, float]:
+        """Images in which a camera saw the target, and the integral of the squared angular rate [rad^2/s]; information
+        is proportional to both."""
+        return float(sum(a.seen for a in self.topics.values())), float(np.trace(self.motion.turning))
+
+    def coarse_problem(self, longest_s: float = WINDOW_S) -> CoarseProblem | None:
+        """The problem of the last `longest_s` of recorded time; None while there is too little."""
         if self.target is None or not self._kept or (rig := self.rig()) is None:
             return None
-        share = min(sum(k.seconds for k in self._kept) / max(self.seconds, 1e-9), 1.0)
+        begin = np.cumsum([k.seconds for k in reversed(self._kept)])[::-1] - longest_s
+        recent = [kept for kept, before in zip(self._kept, begin, strict=True) if before <= 0.0] or [self._kept[-1]]
+        share = min(sum(k.seconds for k in recent) / max(self.seconds, 1e-9), 1.0)
         corners, density = [], [1.0]
         for camera in rig.cameras:
             arrivals = self.topics[self.sensors[camera.name].name]
-            images = [pair for kept in self._kept for pair in kept.corners.get(camera.name, ())]
+            images = [pair for kept in recent for pair in kept.corners.get(camera.name, ())]
             if arrivals.topic.kind != "image" or sum(bool(c.kept.any()) for _, c in images) < FEWEST_VIEWS:
                 rig = rig if arrivals.topic.kind != "image" else rig.without(camera.name)
                 continue
@@ -493,8 +518,8 @@ class Follower:
         rig = rig.without(*(s.name for s in rig.lidars))
         if not corners and not any(self.sensors[c.name].kind == "corners" for c in rig.cameras):
             return None
-        parts = tuple(kept.part for kept in self._kept)
-        return CoarseProblem(rig, parts, tuple(corners), max(density), share, self.seconds)
+        parts = tuple(kept.part for kept in recent)
+        return CoarseProblem(rig, parts, tuple(corners), max(density), share, self.seconds, self.progress)
 
 
 # What is shown: tables, coverage of the images, and advice.
@@ -502,6 +527,8 @@ class Follower:
 
 def view(f: Follower, prediction: Expectation | None) -> View:
     """What is known of a recording, and predicted."""
+    if prediction is not None:
+        prediction = replace(prediction, stds=prediction.stds_at(f.seconds, f.progress))
     cameras = [(name, f.topics[t.name]) for name, t in f.sensors.items() if t.kind == "image"]
     maps = tuple((name, coverage_map(a.cells.tolist())) for name, a in cameras if a.seen)
     tables = [_arrived(f)]
@@ -623,11 +650,11 @@ def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | Non
 
 
 def _show(follower: Follower, solver: Solver, page: Page | None, console: Console) -> None:
-    """Looks and shows, for ever. It rests for as long as it works, so that it takes half a core at most."""
+    """Looks and shows, for ever. It rests for as much time as it works, of a processor, which is then half a core."""
     drawn = printed = -inf
     with Live(console=console, auto_refresh=False, transient=True) if console.is_terminal else nullcontext() as live:
         while True:
-            begin = time.monotonic()
+            begin, worked = time.monotonic(), time.process_time()
             follower.look()
             try:
                 solver.offer(follower.coarse_problem)
@@ -642,4 +669,4 @@ def _show(follower: Follower, solver: Solver, page: Page | None, console: Consol
                 elif begin - printed >= LINE_EVERY_S:
                     printed = begin
                     console.print(now.line, markup=False, highlight=False)
-            time.sleep(max(LOOK_EVERY_S, time.monotonic() - begin))
+            time.sleep(max(LOOK_EVERY_S, time.process_time() - worked))
