@@ -169,6 +169,25 @@ def test_a_scale_of_ranges_is_found(program: ModuleType):
     assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
 
 
+@pytest.mark.parametrize("offset_m", [0.0, 0.02])
+def test_an_offset_of_ranges_is_found(program: ModuleType, offset_m: float):
+    """Walls that are seen at a slant show it: with motion capture, and with an IMU alone."""
+    scenario = program.lidar_imu()
+    lidars = (replace(x, azimuth_steps=225, range_offset_m=offset_m) for x in scenario.of(SimLidar))
+    scenario = scenario.with_sensors(*lidars)
+    rig = program.rig_of(scenario, program.KINDS["LiDAR + IMU"])
+    simulation = simulate(scenario, 1)
+    result = calibrate_measurements(rig, simulation.measurements.unassociated())
+    assert [n.name for n in result.notes].count("ranges_offset") == (offset_m > 0.0)
+    if offset_m:
+        offset = result.group("lidar0", "range_offset")
+        assert abs(offset.value[0] - offset_m) < 4.0 * offset.std[0] < 0.01
+    else:
+        tested = result.effects["lidar0.range_offset"]
+        assert abs(tested["value"][0]) < 5.0 * tested["std"][0] < 0.01
+    assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
+
+
 @pytest.mark.full
 def test_taken_for_ideal_such_an_imu_is_far_off(program: ModuleType):
     """Or the test above could not fail."""

@@ -496,7 +496,7 @@ def lidar_rows_turned(factor, at, turn):
     (offset, scale), before = (at.values[name, x][0] for x in ("range_offset", "range_scale")), factor.range_errors
     too_far = (offset - before[0]) / (1.0 + before[1])
     distance[:, 0] *= (1.0 + scale) / (1.0 + before[1])
-    for e in np.flatnonzero([factor.planes[q][1] == "tilt" for q in m.plane]):  # x - too_far x / |x| at their mean
+    for e in range(len(plane)):  # x - too_far x / |x| at their mean
         mean, a = L[e, 1:, 0] / L[e, 0, 0], distance[e, 1:].copy()
         r = np.linalg.norm(mean)
         to_rest = np.eye(3) - np.outer(mean, mean) / r**2

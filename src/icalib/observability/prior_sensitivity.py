@@ -493,9 +493,10 @@ def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
         is_clocked = layout.has(s.name, TIME_OFFSET.name) and layout.is_free(s.name, TIME_OFFSET.name)
         effects = (spec for spec in s.parameters if spec.is_effect)
         for spec in effects if s is not rig.imu or not rig.assumes_motion else ():
-            p: Parameter = getattr(s, spec.name)
-            if p.mode == "fixed" and p.value is None and (is_clocked or spec != CLOCK_RATE):
-                out[s.name, spec.name] = spec
+            p, key = getattr(s, spec.name), (s.name, spec.name)
+            left_out = p.mode == "fixed" and p.value is None and not (layout.has(*key) and layout.is_free(*key))
+            if left_out and (is_clocked or spec != CLOCK_RATE):
+                out[key] = spec
     return out
 
 

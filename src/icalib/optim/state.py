@@ -227,8 +227,8 @@ def plane_value(value: np.ndarray) -> np.ndarray:
 
 class Planes(NamedTuple):
     """P planes in the world: unit normal (P, 3), its derivatives (P, 2, 3) by the first two parameters, and a point
-    (P, 3) on each [m]. columns (P, 3 or 4): calibration columns, -1 where fixed. The third parameter is the distance;
-    for the target, is_target (P,) bool, it is what a LiDAR measures too much. The fourth is the scale of its ranges.
+    (P, 3) on each [m]. columns (P, 3 or 5): calibration columns, -1 where fixed. The third parameter is the distance.
+    The others are offset and scale of the ranges of a LiDAR.
 
     Points x of the LiDAR become (x - range_offset x / |x|) / (1 + range_scale): what is left of both errors since the
     pass began. range_unit: derivative of both by the parameters, 1 / (1 + scale at the start).
@@ -238,7 +238,6 @@ class Planes(NamedTuple):
     tangents: np.ndarray
     point: np.ndarray
     columns: np.ndarray
-    is_target: np.ndarray
     range_offset: float
     range_scale: float
     range_unit: float
@@ -260,5 +259,4 @@ class Planes(NamedTuple):
                 for key, v in zip(keys, value, strict=True)
             ]
         )
-        is_target = np.array([state.values[key].ndim == 2 for key in keys])
-        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, is_target, *ranges)
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, *ranges)

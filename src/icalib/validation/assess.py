@@ -181,7 +181,7 @@ def _mode(inputs: Inputs, block: Block) -> str:
     """The mode of a group in the result: fixed, prior or free."""
     if block.start is None:
         return "fixed"
-    if block.is_nuisance:
+    if block.is_nuisance or inputs.specs[block.key].is_effect:
         return "prior"
     if not inputs.is_sensor(block.sensor):
         return "free"

@@ -55,7 +55,8 @@ def solved(r, state, found):
     """The state of a solve with the planes and association `found`."""
     entries = [("imu0", "intrinsics", "vector", 24, False)]
     entries += [(s.name, name, kind, size, True) for s in r.streams for name, kind, size in FREE]
-    entries += [(s.name, name, "vector", 1, False) for s in r.streams for name in ("clock_rate", "range_scale")]
+    fixed = ("clock_rate", "range_offset", "range_scale")
+    entries += [(s.name, name, "vector", 1, False) for s in r.streams for name in fixed]
     layout = make_layout(entries + found.association.entries)
     kept = {k: v for k, v in state.values.items() if k[1] != "plane"}
     state = replace(state, values=kept | found.values)

@@ -29,16 +29,16 @@ from icalib.motion.sensor_pose import chain_width, fill_chain, fill_imu_pose
 from icalib.optim.rows import add_gram, add_product
 from icalib.optim.state import KEYFRAME_DIM
 
-POSE_DIM, PLANE_DIM = 6, 3  # parameters of a pose and of a plane
+POSE_DIM, PLANE_DIM, RANGE_DIM = 6, 3, 2  # parameters of a pose, of a plane, and of ranges: their offset and scale
 
 
 class NoiseSums(NamedTuple):
     """Products of Jacobians by the unknown rotation x, summed over the bins on one side of a keyframe.
 
-    information (3, 3): products of x with itself. by_pose (3, w + 2): products of x with the w columns of keyframes and
-    calibration parameters that act through the pose, with the scale of ranges, and with the residual. by_plane (P, 3,
-    3): products of x with the columns of each plane; only those of the first n_planes (1,) numbers in `planes` (P,) are
-    filled.
+    information (3, 3): products of x with itself. by_pose (3, w + 3): products of x with the w columns of keyframes and
+    calibration parameters that act through the pose, with offset and scale of ranges, and with the residual. by_plane
+    (P, 3, 3): products of x with the columns of each plane; only those of the first n_planes (1,) numbers in `planes`
+    (P,) are filled.
     """
 
     information: np.ndarray
@@ -52,9 +52,8 @@ class NoiseSums(NamedTuple):
 def empty_noise_sums(width, n_planes):
     """`NoiseSums` of zero. width: number of columns that act through the pose; n_planes: of planes."""
     by_plane = np.zeros((n_planes, 3, PLANE_DIM))
-    return NoiseSums(
-        np.zeros((3, 3)), np.zeros((3, width + 2)), by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64)
-    )
+    by_pose = np.zeros((3, width + RANGE_DIM + 1))
+    return NoiseSums(np.zeros((3, 3)), by_pose, by_plane, np.zeros(n_planes, np.int64), np.zeros(1, np.int64))
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -89,31 +88,33 @@ def add_pose_noise(gram, J_pose, noise):
 
 @njit(cache=True, nogil=True, inline="always")
 def add_plane_noise(J_rows_noise, J_rows, q, noise):
-    """Adds the products of x with plane q and the scale of ranges in one bin. J_rows (11, 4): derivatives by the pose,
-    the plane, and the scale."""
+    """Adds the products of x with plane q and the ranges in one bin. J_rows (12, 4): derivatives by the pose, the
+    plane, and the ranges."""
     known = False
     for i in range(noise.n_planes[0]):
         known = known or noise.planes[i] == q
     if not known:
         noise.planes[noise.n_planes[0]] = q
         noise.n_planes[0] += 1
-    scale = noise.by_pose.shape[1] - 2
+    first = noise.by_pose.shape[1] - RANGE_DIM - 1
     for a in range(3):
         for c in range(4):
-            noise.by_pose[a, scale] += J_rows_noise[a, c] * J_rows[SCALE, c]
+            for t in range(RANGE_DIM):
+                noise.by_pose[a, first + t] += J_rows_noise[a, c] * J_rows[OFFSET + t, c]
             for t in range(PLANE_DIM):
                 noise.by_plane[q, a, t] += J_rows_noise[a, c] * J_rows[POSE_DIM + t, c]
 
 
 @njit(cache=True, nogil=True, inline="always")
 def noise_columns(noise, columns, plane_columns):
-    """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then that of the scale of
-    ranges and those of the planes seen, from plane_columns (P, 4)."""
-    n_c, n = len(columns) + 1, noise.n_planes[0]
+    """(m,) calibration columns of the sums: `columns` (c,), which act through the pose, then those of the ranges and of
+    the planes seen, from plane_columns (P, 5)."""
+    n_c, n = len(columns) + RANGE_DIM, noise.n_planes[0]
     out = np.empty(n_c + PLANE_DIM * n, np.int64)
     for j in range(len(columns)):  # in loops: copies of arrays take seconds to compile
         out[j] = columns[j]
-    out[n_c - 1] = plane_columns[0, PLANE_DIM]
+    for t in range(RANGE_DIM):
+        out[len(columns) + t] = plane_columns[0, PLANE_DIM + t]
     for i in range(n):
         for t in range(PLANE_DIM):
             out[n_c + PLANE_DIM * i + t] = plane_columns[noise.planes[i], t]
@@ -152,7 +153,8 @@ def eliminated_noise(noise):
 
 
 N_WHITENED = 4  # residuals of an entry
-SCALE = POSE_DIM + PLANE_DIM  # row of the scale of ranges in the arrays of an entry, after pose and plane
+OFFSET = POSE_DIM + PLANE_DIM  # row of the offset of ranges in the arrays of an entry, after pose and plane
+SCALE = OFFSET + 1  # row of their scale
 DISTANCE = SCALE + 1  # row of the residual itself, after its derivatives
 
 
@@ -202,12 +204,12 @@ def _shorten(row, root, offset, derivative):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _correct_ranges(row, root, q, planes, derivative):
+def _correct_ranges(row, root, planes, derivative):
     """Applies offset and scale of ranges to coefficients `row` (4,) of (1, x). Lengths are those that the LiDAR
-    measures: in true lengths, a larger scale would make the noise smaller. For the target, fills derivative (4,), that
-    of the coefficients by the offset."""
+    measures: in true lengths, a larger scale would make the noise smaller. If the offset is free, fills derivative
+    (4,), that of the coefficients by it."""
     row[0] *= 1.0 + planes.range_scale
-    if planes.is_target[q]:
+    if planes.columns[0, PLANE_DIM] >= 0:
         _shorten(row, root, planes.range_offset, derivative)
         for c in range(N_WHITENED):
             derivative[c] *= planes.range_unit
@@ -215,8 +217,8 @@ def _correct_ranges(row, root, q, planes, derivative):
 
 @njit(cache=True, nogil=True)
 def _fill_jacobian(R_lw, p_wl, q, planes, m, root, J_distance):
-    """Fills J_distance (11, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows), plane (3
-    rows) and scale of ranges, then in the distance. root (10,): of the moments of the points.
+    """Fills J_distance (12, 4): coefficients of (1, x) in the derivatives of the distance by pose (6 rows), plane (3
+    rows), offset and scale of ranges, then in the distance. root (10,): of the moments of the points.
 
     With a = R^T n the derivatives by the pose are (x cross a; a), because a rotation t of the LiDAR moves x by
     t cross x, and a . (t cross x) = t . (x cross a).
@@ -236,10 +238,9 @@ def _fill_jacobian(R_lw, p_wl, q, planes, m, root, J_distance):
     A[POSE_DIM + 2, 0] = -1.0
     for c in range(N_WHITENED):
         A[DISTANCE, c] = m[c]
-    A[POSE_DIM + 2, 0] *= 1.0 + planes.range_scale
-    for i in range(POSE_DIM + 2):
-        _correct_ranges(A[i], root, q, planes, A[POSE_DIM + 2])
-    _correct_ranges(A[DISTANCE], root, q, planes, A[POSE_DIM + 2])
+    for i in range(OFFSET):
+        _correct_ranges(A[i], root, planes, A[OFFSET])
+    _correct_ranges(A[DISTANCE], root, planes, A[OFFSET])
     A[SCALE, 0] = planes.range_unit * m[0]
 
 
@@ -273,14 +274,14 @@ def _add_pose_gram(J_rows, J_distance, incidence, gram):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
-    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (4,) of its plane, of
-    which some may be fixed.
+    """Adds to the sums of keyframe k all products of an entry with the columns `plane_columns` (5,) of its plane and of
+    the ranges, of which some may be fixed.
 
-    J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (4, w): workspace.
+    J_pose (6, w): derivative of the pose of the bin by keyframes and calibration columns (c,); V (5, w): workspace.
     """
     B, n_b, n_chain = J_rows, sums.calib.shape[0] - 1, J_pose.shape[1] - len(columns)
     V[:] = 0.0
-    n = PLANE_DIM + 1 if plane_columns[PLANE_DIM] >= 0 else PLANE_DIM
+    n = PLANE_DIM + RANGE_DIM if max(plane_columns[PLANE_DIM], plane_columns[PLANE_DIM + 1]) >= 0 else PLANE_DIM
     for i in range(POSE_DIM):
         for t in range(n):
             b = B[POSE_DIM + t]
@@ -312,9 +313,9 @@ def _add_plane(k, J_rows, J_pose, columns, plane_columns, sums, V):
 
 @njit(cache=True, nogil=True, inline="always")
 def _add_plane_incidence(J_distance, incidence, plane_columns, sums):
-    """Adds the gradient of the incidence term by the plane with columns `plane_columns` (4,) to the sums."""
+    """Adds the gradient of the incidence term by the plane and ranges with columns `plane_columns` (5,) to the sums."""
     n_b = sums.calib.shape[0] - 1
-    for t in range(PLANE_DIM + 1):
+    for t in range(PLANE_DIM + RANGE_DIM):
         J = J_distance[POSE_DIM + t]
         s = J[1] * incidence[1] + J[2] * incidence[2] + J[3] * incidence[3]
         if plane_columns[t] >= 0:
@@ -343,7 +344,7 @@ def _is_last_of_side(i, bins):
 class _BinWork(NamedTuple):
     """Workspace. J_pose (6, w), J_imu_pose (6, 6): see `fill_chain`; m (4,): see `_fill_distance`.
 
-    J_distance, J_rows (11, 4): derivatives of an entry, and these times its root. gram (6, 7): products of the
+    J_distance, J_rows (12, 4): derivatives of an entry, and these times its root. gram (6, 7): products of the
     derivatives of a bin by its pose with themselves and with the residual. gram_noise (3, 6): their products with the
     derivatives by the unknown rotation. F, V: see `add_gram` and `_add_plane`.
     """
@@ -373,7 +374,7 @@ def _work_space(at, n_columns):
         np.empty((POSE_DIM, POSE_DIM + 1)),
         np.empty((3, POSE_DIM)),
         np.empty((POSE_DIM, width + 1)),
-        np.empty((PLANE_DIM + 1, width)),
+        np.empty((PLANE_DIM + RANGE_DIM, width)),
     )
 
 
@@ -385,7 +386,7 @@ def _fill_residuals(e, R_lw, p_wl, bins, planes, work, rows):
     _fill_distance(R_lw, p_wl, bins.plane[e], planes, m)
     for c in range(N_WHITENED):
         work.J_distance[0, c] = m[c]
-    _correct_ranges(work.J_distance[0], bins.root[e], bins.plane[e], planes, work.J_distance[1])
+    _correct_ranges(work.J_distance[0], bins.root[e], planes, work.J_distance[1])
     _times_root(work.J_distance, bins.root[e], rows[e : e + 1])
     cost = incidence[e, 0]
     for c in range(N_WHITENED):
@@ -430,7 +431,7 @@ def _add_entry(e, k, R_lw, p_wl, bins, planes, columns, work, sums, rows, noise,
         _add_pose_gram(B, A, bins.incidence[e], work.gram)
     if has_noise:
         add_entry_noise(bins.J_rows_noise[e], bins.J_incidence_noise[e], rows[e], B, work.gram_noise, noise)
-    if wanted and max(plane_columns[0], plane_columns[2], plane_columns[3]) >= 0:
+    if wanted and max(plane_columns[0], plane_columns[3], plane_columns[4]) >= 0:
         _add_plane(k, B, work.J_pose, columns, plane_columns, sums, work.V)
         _add_plane_incidence(A, bins.incidence[e], plane_columns, sums)
         if has_noise:

@@ -31,14 +31,16 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
     isotropic."""
 
     def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
-        """See `SensorModel`. Only sheets whose distance is known from images show a range offset; surfaces that LiDARs
-        at rest share show no scale either."""
-        on_boards = association.at_rest and rig.has_target
-        observable = spec is not RANGE_SCALE or on_boards or not association.at_rest
-        if spec is RANGE_OFFSET:
+        """See `SensorModel`. Surfaces that LiDARs at rest share show neither offset nor scale of ranges. The offset is
+        always estimated on sheets, whose distance is known from images."""
+        on_sheets = association.at_rest and rig.has_target
+        if spec in (RANGE_OFFSET, RANGE_SCALE) and association.at_rest and not on_sheets:
+            return False
+        if spec is RANGE_OFFSET and sensor.range_offset.value is None:
             k = [x.name for x in rig.lidars].index(sensor.name)
-            observable = on_boards or bool(association.sheets and association.points_on_sheets[k].any())
-        return observable and super().is_estimated(sensor, spec, rig, association)
+            on_sheets = on_sheets or bool(association.sheets and association.points_on_sheets[k].any())
+            return on_sheets or sensor.range_offset.mode == "free"
+        return super().is_estimated(sensor, spec, rig, association)
 
     def keyframe_times(
         self, sensors: Sequence[Lidar], rig: Rig, streams: Mapping[str, Any], values: Mapping[Key, np.ndarray]

@@ -28,7 +28,6 @@ from icalib.motion.sensor_pose import Kinematics, SensorPose
 from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.state import Key, Layout, Planes, State, plane_value
 from icalib.rig import Scheme
-from icalib.rig.scene import TILT
 from icalib.sensors.lidar import kernels
 from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
@@ -60,8 +59,7 @@ class LidarFactor(RowFactor):
     keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
     J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
     in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Ranges
-    have been corrected by the range_errors of the state from which the pass starts; changes of the offset within it act
-    on the sheet alone, which shows it.
+    have been corrected by the range_errors of the state from which the pass starts.
     """
 
     name: str
@@ -122,10 +120,10 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _plane_columns(self) -> np.ndarray:
-        """(P, 4) calibration columns of each plane, see `Planes`."""
-        last = {TILT.name: ((self.name, RANGE_OFFSET.name),)}
-        of_planes = ((p, *last.get(p[1], ()), (self.name, RANGE_SCALE.name)) for p in self.planes)
-        return np.array([np.concatenate([self.layout.block(*key).columns for key in keys]) for keys in of_planes])
+        """(P, 5) calibration columns of each plane, see `Planes`. The distance of the sheet of the target is known."""
+        ranges = [self.layout.block(self.name, x.name).columns for x in (RANGE_OFFSET, RANGE_SCALE)]
+        planes = (np.append(self.layout.block(*p).columns, -1)[: kernels.PLANE_DIM] for p in self.planes)
+        return np.array([np.concatenate([plane, *ranges]) for plane in planes])
 
     @property
     def key(self) -> FactorKey:

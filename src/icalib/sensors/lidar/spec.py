@@ -28,8 +28,9 @@ RANGE_OFFSET = ParameterSpec(
     tolerance=5e-3,
     prior_sigma=0.03,  # range accuracy that data sheets of spinning LiDARs state, as the VLP-16's
     is_auxiliary=True,
+    is_effect=True,
     meaning="measured less true range, the same at all ranges",
-    motion="show the board nearer and farther",
+    motion="show the board nearer and farther, and walls from all sides",
 )
 # Measured over true range, less 1. The prior is that accuracy over 30 m, to which many points are.
 RANGE_SCALE = ParameterSpec(
@@ -75,7 +76,7 @@ class Lidar(MountedSensor):
     topic: str | None = None  # topic of the clouds; None: the topic with the LiDAR's name, or the only one
     point_time_field: str | None = None
     point_time_unit: TimeUnit | None = None
-    range_offset: Parameter = Parameter()
+    range_offset: Parameter = Parameter("fixed")
     range_scale: Parameter = Parameter("fixed")
 
     @classmethod

@@ -24,12 +24,12 @@ from icalib.optim.state import State, plane_value
 from icalib.result import Plane, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, times
-from icalib.rig import Lidar, Rig
-from icalib.sensors.lidar.assess.boards import on_boards, sheet_notes, sheet_planes, wrong_sheets
+from icalib.rig import Lidar, ParameterSpec, Rig
+from icalib.sensors.lidar.assess.boards import on_boards, ranges_offset, sheet_notes, sheet_planes, wrong_sheets
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.patch_factor import PatchFactor
 from icalib.sensors.lidar.residual import LidarFactor, true_ranges
-from icalib.sensors.lidar.spec import RANGE_SCALE
+from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
@@ -47,48 +47,52 @@ def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     if a.inputs.association.at_rest:
         if a.inputs.rig.has_target:
-            return replace(on_boards(a), causes=range_scale_causes(a))
+            return replace(on_boards(a), causes=range_causes(a))
         return Assessment(notes=_notes_on_patches(a))
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), range_scale_notes(a)),
+        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), range_notes(a)),
         warnings=chain(warnings(a.inputs, a.estimate), wrong_sheets(a)),
-        causes=range_scale_causes(a),
+        causes=range_causes(a),
     )
 
 
-def range_scale_causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each LiDAR whose ranges have another scale than all other lengths. Beside a target it may be the
-    target whose size is wrong."""
+def range_causes(a: AssessedEstimate) -> Iterator[Cause]:
+    """A cause for each LiDAR whose ranges have another scale than all other lengths, or an offset. Beside a target a
+    scale may be that of the target, whose size is wrong."""
     for e in a.effects:
-        if e.spec is not RANGE_SCALE or not e.differs:
+        if e.spec not in (RANGE_OFFSET, RANGE_SCALE) or not e.differs:
             continue
-        field, remedy = f"range_scale: {{prior: 0, sigma: {e.prior_sigma:.2g}}} for {e.sensor}.", Remedy(e.amended)
-        advice = f"Write {field}"
-        if a.inputs.rig.has_target:
+        field = f"{e.spec.name}: {{prior: 0, sigma: {e.prior_sigma:.2g}}} for {e.sensor}."
+        advice, remedy = f"Write {field}", Remedy(e.amended)
+        if a.inputs.rig.has_target and e.spec is RANGE_SCALE:
             advice, remedy = (
                 f"Measure the target and correct its size in the rig file. If it is right: write {field}",
                 None,
             )
-        off = _percent(float(e.value[0]), float(e.std[0]))
-        sentence = f"ranges of {e.sensor} are {off} than other sensors say. {advice}"
+        off, than = _off(e.spec, float(e.value[0]), float(e.std[0])), "other sensors say"
+        than = than if e.spec is RANGE_SCALE else "walls show that are seen at a slant"
+        sentence = f"ranges of {e.sensor} are {off} than {than}. {advice}"
         yield Cause(Remark("ranges_contradict", sentence), e.gain, e.moves > 1.0, remedy=remedy)
 
 
-def _percent(scale: float, std: float) -> str:
+def _off(spec: ParameterSpec, value: float, std: float) -> str:
     """How much too long or short ranges are."""
-    return f"{100.0 * abs(scale):.2g} +- {100.0 * std:.2g} % {'longer' if scale > 0.0 else 'shorter'}"
+    unit, times = ("%", 100.0) if spec is RANGE_SCALE else spec.display_unit
+    return f"{times * abs(value):.2g} +- {times * std:.2g} {unit} {'longer' if value > 0.0 else 'shorter'}"
 
 
-def range_scale_notes(a: AssessedEstimate) -> Iterator[Remark]:
-    """A note for each LiDAR whose ranges have a scale of their own in the result."""
+def range_notes(a: AssessedEstimate) -> Iterator[Remark]:
+    """Notes on each LiDAR whose ranges have an offset or a scale of their own in the result."""
+    for lidar in a.inputs.rig.lidars:
+        yield from ranges_offset(a, lidar.name)
     for g in a.groups:
         if g.name == RANGE_SCALE.name and g.columns is not None and abs(g.value[0]) > EFFECT_SIGMAS * g.std[0]:
             yield Remark(
                 "range_scale_estimated",
-                f"ranges of {g.sensor} are {_percent(float(g.value[0]), float(g.std[0]))} than true ones, which the "
-                f"estimate includes; divide them by {1.0 + g.value[0]:.5g} where you use them, too.",
+                f"ranges of {g.sensor} are {_off(RANGE_SCALE, float(g.value[0]), float(g.std[0]))} than true ones, "
+                f"which the estimate includes; divide them by {1.0 + g.value[0]:.5g} where you use them, too.",
             )
 
 

@@ -137,7 +137,7 @@ def sheet_planes(inputs: Inputs, state: State) -> Iterator[Plane]:
 
 
 def sheet_notes(a: AssessedEstimate) -> Iterator[Remark]:
-    """The number of points on the sheet whose size the rig file gives, and the offset of ranges that they show."""
+    """The number of points on the sheet whose size the rig file gives."""
     association, bodies = a.inputs.association, a.inputs.bodies
     if not association.count or not bodies.used or not bodies.target.has_sheet[bodies.used[0]]:
         return
@@ -147,7 +147,6 @@ def sheet_notes(a: AssessedEstimate) -> Iterator[Remark]:
                 "lidar_points_on_sheet",
                 f"{points} points of {lidar.name} lie on the target; its place is that in the images.",
             )
-            yield from ranges_offset(a, lidar.name)
         else:
             yield Remark(
                 "target_unseen_by_lidar",
