@@ -263,6 +263,16 @@ def refuse_foreign(paths: Iterable[Path], inputs: Iterable[Path] = (), advice: s
             raise CalibrationError(f"{path} cannot be read ({error.strerror or error}); {advice}.") from error
 
 
+def refuse_unwritable(files: Iterable[Path | None], inputs: Iterable[Path | None]) -> None:
+    """Raises CalibrationError if the folder of one of `files` does not exist, or as `refuse_foreign`; None: no file. To
+    be called before a long run."""
+    written = [path for path in files if path]
+    for path in written:
+        if not path.parent.is_dir():
+            raise CalibrationError(f"{path} cannot be written (its folder does not exist); choose another place.")
+    refuse_foreign(written, [path for path in inputs if path], "choose another place")
+
+
 def refuse_existing(path: Path, advice: str = "give another name") -> None:
     """Raises CalibrationError if `path` exists, whoever wrote it. advice: end of the message."""
     if os.path.lexists(path):

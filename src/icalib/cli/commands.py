@@ -337,7 +337,7 @@ def _fleet(options: argparse.Namespace) -> int:
 def _inspect(options: argparse.Namespace) -> None:
     if options.follow or options.serve:
         return _follow(options)
-    from icalib.base.files import printable, refuse_existing, refuse_foreign, write_new, write_sealed
+    from icalib.base.files import printable, refuse_existing, refuse_unwritable, write_new, write_sealed
     from icalib.cli.console import console_progress
     from icalib.tools.inspection import draft_rig, inspect_recording, read_target
     from icalib.tools.inspection.console import figures_json, inspection_html, print_inspection
@@ -345,11 +345,7 @@ def _inspect(options: argparse.Namespace) -> None:
     if options.rig:
         advice = "give another name for the draft, or give it as --target to use the target in it"
         refuse_existing(options.rig, advice)
-    written = [path for path in (options.json, options.html) if path]
-    for path in written:
-        if not path.parent.is_dir():
-            raise CalibrationError(f"{path} cannot be written (its folder does not exist); choose another place.")
-    refuse_foreign(written, [p for p in (options.recording, options.target) if p], "choose another place")
+    refuse_unwritable((options.json, options.html), (options.recording, options.target))
     target = read_target(options.target) if options.target else None
     with console_progress(options.quiet) as progress:
         inspection = inspect_recording(

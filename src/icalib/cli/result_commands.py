@@ -132,13 +132,12 @@ def _add_check(commands: argparse._SubParsersAction[CommandParser]) -> None:
 
 
 def _check(options: argparse.Namespace) -> int:
-    from icalib.base.files import refuse_foreign, set_of, write_sealed
+    from icalib.base.files import refuse_unwritable, set_of, write_sealed
     from icalib.cli.console import console_progress
     from icalib.result import load_calibration
     from icalib.tools.check import check_calibration, check_html, check_json, lines, with_places
 
-    written = [path for path in (options.json, options.html) if path]
-    refuse_foreign(written, [*set_of(options.result), *options.recording], "choose another place")
+    refuse_unwritable((options.json, options.html), (*set_of(options.result), *options.recording))
     calibration = load_calibration(options.result)
     calibration = with_places(calibration, topic=dict(options.topic), path=dict(options.path))
     with console_progress(options.quiet) as progress:
@@ -221,12 +220,12 @@ def _tolerance(text: str) -> tuple[str, float]:
 
 
 def _compare(options: argparse.Namespace) -> int:
-    from icalib.base.files import refuse_foreign, set_of, write_sealed
+    from icalib.base.files import refuse_unwritable, set_of, write_sealed
     from icalib.tools.comparison.compare import ComparisonTolerances, comparison_html, comparison_json, lines
     from icalib.tools.comparison.reading import compare_files
 
     inputs = [p for side in (options.a, options.b) for p in (side, *set_of(side))]
-    refuse_foreign([path for path in (options.json, options.html) if path], inputs, "choose another place")
+    refuse_unwritable((options.json, options.html), inputs)
     tolerances = ComparisonTolerances(**dict(options.tolerance))
     comparison = compare_files(options.a, options.b, dict(options.frame), tolerances, options.sigma)
     if options.json:

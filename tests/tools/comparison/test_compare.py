@@ -392,6 +392,10 @@ def test_a_page_shows_what_differs_first(
     capsys.readouterr()
     assert main(["compare", *map(str, folders), "--html", str(folders[0] / "result.json"), "-q"]) == 2
     assert "result.json is an input of this command" in capsys.readouterr().err
+    for kind in ("json", "html"):
+        away = str(page.parent / "away" / f"f.{kind}")
+        assert main(["compare", *map(str, folders), f"--{kind}", away, "-q"]) == 2
+        assert f"f.{kind} cannot be written (its folder does not exist)" in capsys.readouterr().err
     assert_drawn(text, {"changes-in-sigma"})
 
 
