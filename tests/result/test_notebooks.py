@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "examples").rglob("*.ipynb"))
 PRINTED = {
     "calibrate": ("same rig -> valid []", "cam1 turned -> changed [('cam1', 'rotation'"),
-    "camera-imu": ("'cam0': '/cam0/image_raw'", "type: aprilgrid", "errors of the camera's place in sigma"),
+    "camera-imu": ("/cam0/image_raw', 'image', 40", "type: aprilgrid", "errors of the camera's place in sigma"),
     "gnss": ("type: position", "time offset [ms] [", "errors of the lever arm in sigma"),
     "lidar-camera": ("type: checkerboard", "('cam0', 'lidar0', 'the worst of", "errors of the LiDAR's place in sigma"),
 }

@@ -10,6 +10,7 @@ import pytest
 from rosbags.rosbag1 import Reader
 
 from icalib.cli import main
+from icalib.data.recordings import open_recording
 from icalib.tools.inspection import inspect_recording
 from icalib.tools.inspection.facts import clock_rate_of, overlap_s, timing_of
 
@@ -132,5 +133,10 @@ def test_a_bag_tells_the_rates_of_its_clocks(tmp_path, monkeypatch):
     hints = [f.sentence for f in inspect_recording("run.bag").findings if "receive times" in f.sentence]
     assert len(hints) == 1 and hints[0].startswith("/mocap/pose: header stamps run 80 +- ")
     assert "slow against receive times, 0.79 ms over the recording" in hints[0]
+    opened = open_recording("run.bag", 2.0, 6.0)
+    notes = opened.notes()
     inside = inspect_recording("run.bag", start_s=2.0, end_s=6.0)
+    again = inspect_recording(opened)
+    assert (again.findings, again.streams) == (inside.findings, inside.streams)
+    assert opened.notes() == notes
     assert [s.clock_rate.duration_s for s in inside.streams if s.clock_rate] == pytest.approx([3.99, 3.98], abs=0.02)

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from icalib.base.yaml_nodes import read_yaml
-from icalib.data.recordings import Recording, TopicInfo, open_recording
+from icalib.data.recordings import Recording, Source, TopicInfo, open_recording
 from icalib.errors import RecordingError, RigError
 from icalib.geometry.targets import Scene
 from icalib.kinds import inspectors
@@ -53,27 +53,29 @@ READING_SHARE = 0.3  # progress after reading, if the target is then searched fo
 
 
 def inspect_recording(
-    path: str | Path,
+    source: Source,
     target: GivenTarget | None = None,
     progress: Progress = lambda *_: None,
     *,
     start_s: float = 0.0,
     end_s: float = inf,
 ) -> Inspection:
-    """Reads the recording at `path`: its sensors, and whether it can be calibrated. start_s, end_s: part that is read,
-    s after the start.
+    """Reads the recording `source`: its sensors, and whether it can be calibrated. start_s, end_s: part that is read,
+    s after the start, unless it is opened already.
 
     The `target`, or that of a Kalibr file beside the recording, is searched for in all images; `calibrate` uses the
     found corners again. Raises RecordingError, one sentence, if there is no recording or it is empty. Faults of single
     topics become findings.
     """
-    recording = open_recording(path, start_s, end_s)
+    if isinstance(source, Recording):  # opened again, so that notes of this reading are not in the caller's
+        source, start_s, end_s = source.root, source.window.start_s, source.window.end_s
+    path, recording = Path(source), open_recording(source, start_s, end_s)
     topics = recording.topics()
     if not any(t.count for t in topics):
         raise RecordingError(
             f"{path} holds no messages, images or tables; give a bag, or a folder with imu0/data.csv and cam0/data."
         )
-    kinds, sources, kalibr = inspectors().values(), find_sources(topics), find_kalibr_files(Path(path))
+    kinds, sources, kalibr = inspectors().values(), find_sources(topics), find_kalibr_files(path)
     for kind in kinds:
         sources = kind.joined(recording, sources)
     target = target or _beside(kalibr)
