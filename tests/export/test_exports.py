@@ -431,6 +431,14 @@ def test_a_rolling_shutter_and_a_drifting_clock_are_said(robot: Calibration, to:
         assert "clock_rate" not in export(robot, to).files["calibration.json"]
 
 
+@pytest.mark.parametrize("to", ["ros2-static", "urdf", "autoware", "mins", "fast-lio", "fast-livo2", "lio-sam"])
+def test_errors_of_ranges_are_said(robot: Calibration, to: str):
+    one, names = np.full(1, 1e-3), ("range_offset", "range_scale")
+    more = [ParameterGroup("lidar0", n, (n,), "", one, one, one, ("determined",), "prior") for n in names]
+    found = export(dataclasses.replace(robot, groups=(*robot.groups, *more)), to)
+    assert "range offset and range scale of lidar0" in " ".join(found.sentences)
+
+
 @pytest.mark.parametrize("to", FORMATS)
 def test_effects_on_the_imu_are_said(robot: Calibration, to: str):
     """Kalibr has a field for the size effect, json for all, and COLMAP none for IMUs."""

@@ -18,9 +18,8 @@ from icalib.geometry.cameras.convert import fit_model
 from icalib.result import Calibration, Verdict
 from icalib.result.quantities import in_body_frame
 from icalib.result.verdict import TOO_UNCERTAIN
-from icalib.rig.rig import SENSOR_TYPES
 from icalib.sensors.imu.spec import EFFECTS, INTRINSICS
-from icalib.sensors.sensor import MOUNTED_NAMES
+from icalib.sensors.sensor import CLOCK_RATE, MOUNTED_NAMES
 
 
 @dataclass(frozen=True)
@@ -182,14 +181,12 @@ def _time_offset_words(name: str, value: np.ndarray) -> str:
     return f"the time offset of {name} ({1e3 * value[0]:+.3f} ms)"
 
 
-def sensor_intrinsics(c: Calibration) -> list[str]:
-    """Words for parameters of mounted sensors other than cameras, beyond pose and time offset, such as "radii and
-    baseline of wheel0"."""
-    phrases = []
-    for name in others(c, *c.cameras):
-        specs = SENSOR_TYPES[c.rig["sensors"][name]["type"]].parameters
-        excluded = {*MOUNTED_NAMES, *(spec.name for spec in specs if spec.manifold == "nuisance")}
-        groups = [g.name for g in c.groups if g.sensor == name and g.name not in excluded]
+def sensor_intrinsics(c: Calibration, names: Sequence[str] | None = None) -> list[str]:
+    """Words for parameters of sensors beyond pose and clock, such as "radii and baseline of wheel0". names: by default
+    all but cameras and IMUs."""
+    phrases, said = [], (*MOUNTED_NAMES, CLOCK_RATE.name)
+    for name in others(c, *c.cameras, *imus(c)) if names is None else names:
+        groups = [g.name for g in c.groups if g.sensor == name and g.name not in said]
         words = [group.replace("_", " ") for group in groups]
         phrases += [f"{', '.join(words[:-1])}{' and ' if words[1:] else ''}{words[-1]} of {name}"] if words else []
     return phrases

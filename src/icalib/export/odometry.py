@@ -24,6 +24,7 @@ from icalib.export.common import (
     no_place_for,
     opencv_matrix,
     others,
+    sensor_intrinsics,
     time_offset,
     time_offsets,
     topic,
@@ -137,6 +138,11 @@ _TIME = "t_imu = t_{0} + timeoffset [s]."
 _POSE = "T_imu_{0} takes coordinates in the {1} frame to the imu frame: p_imu = T_imu_{0} p_{0}."
 
 
+def _of_imu_and_lidars(c: Calibration) -> list[str]:
+    """Words for the parameters of IMU and LiDARs beyond pose and clock."""
+    return imu_parameters(c, imus(c)[:1]) + sensor_intrinsics(c, c.lidars)
+
+
 def mins(c: Calibration) -> Export:
     """One file for each kind of sensor in the rig. Of wheels, only the first set with left and right radii is exported.
     Raises CalibrationError without an IMU."""
@@ -146,7 +152,7 @@ def mins(c: Calibration) -> Export:
     pairs = [name for name in c.wheels if (name, "radii") in ((g.sensor, g.name) for g in c.groups)]
     positions = c.of_type("position")
     covered = [*c.cameras, *c.lidars, *pairs[:1], *positions]
-    sentences += no_place_for("MINS", [*imu_parameters(c, imus(c)[:1]), *others(c, *covered)]) + guesses(c, covered)
+    sentences += no_place_for("MINS", [*_of_imu_and_lidars(c), *others(c, *covered)]) + guesses(c, covered)
     files = {"config_imu.yaml": _mins_imu(c, imu)}
     if c.cameras:
         cameras = {f"cam{i}": _mins_camera(c, name, lens) for i, (name, lens) in enumerate(lenses.items())}
@@ -403,7 +409,7 @@ def fast_lio(c: Calibration) -> Export:
     """FAST-LIO: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "FAST-LIO")
     need(c.lidars, "LiDAR", "FAST-LIO")
-    omissions = [*others(c, *c.lidars), *imu_parameters(c, imus(c)[:1])]
+    omissions = [*others(c, *c.lidars), *_of_imu_and_lidars(c)]
     sentences = no_place_for("FAST-LIO", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("FAST-LIO"),
@@ -429,7 +435,7 @@ def fast_livo2(c: Calibration) -> Export:
     camera = c.cameras[0]
     lens = lens_of(c, camera, "FAST-LIVO2", tuple(_LENSES))
     sentences = (lens.sentence,) if lens.sentence else ()
-    omissions = [*others(c, camera, *c.lidars), *imu_parameters(c, imus(c)[:1])]
+    omissions = [*others(c, camera, *c.lidars), *_of_imu_and_lidars(c)]
     sentences += no_place_for("FAST-LIVO2", omissions) + guesses(c, [camera, *c.lidars])
     comments = [
         _MERGE.format("FAST-LIVO2"),
@@ -461,7 +467,7 @@ def lio_sam(c: Calibration) -> Export:
     """LIO-SAM: one file for each LiDAR. Raises CalibrationError without an IMU or a LiDAR."""
     imu = need_imu(c, "LIO-SAM")
     need(c.lidars, "LiDAR", "LIO-SAM")
-    omissions = [*others(c, *c.lidars), *imu_parameters(c, imus(c)[:1]), *time_offsets(c, c.lidars)]
+    omissions = [*others(c, *c.lidars), *_of_imu_and_lidars(c), *time_offsets(c, c.lidars)]
     sentences = no_place_for("LIO-SAM", omissions) + guesses(c, c.lidars)
     comments = [
         _MERGE.format("LIO-SAM"),
