@@ -36,6 +36,7 @@ from icalib.tools.inspection.follow import (
     ExpectedStd,
     Follower,
     Solver,
+    follow,
     predict,
     view,
 )
@@ -215,7 +216,12 @@ def expected(group: str, label: str, std: float) -> ExpectedStd:
 def test_advice_names_the_axis_and_the_place_in_the_image(target: Path):
     given = read_target(target)
     f = follower_at(given, cam0=(50, 50))
-    assert view(f, None).advice[0] == "Keep moving: there is too little yet for a prediction."
+    assert view(f, None).advice[0].startswith("Keep moving: the first prediction is on its way")
+    few = view(follower_at(given, cam0=(20, 20)), None).advice[0]
+    assert few == "Keep moving: a prediction needs 25 images with the target."
+    assert view(follower_at(given), None).advice == (
+        "A prediction needs a camera that sees the target: record its images, or correct the rig file.",
+    )
     turned = {"cam0": np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])}  # y of cam0 is z of imu0
     weak = expected("rotation", "x", 0.002)
     now = view(f, Expectation(10.0, (weak,), turned))
@@ -314,8 +320,7 @@ def test_the_view_fits_the_terminal(width: int, height: int, target: Path):
 
 def test_a_recorder_that_has_ended_is_said_first(target: Path):
     f = follower_at(read_target(target), cam0=(50, 50))
-    for arrivals in f.topics.values():
-        arrivals.arrived = time.monotonic() - 12.2
+    f.arrived = time.monotonic() - 12.2
     assert view(f, None).advice[0] == "Nothing has arrived for 12 s: the recorder has ended, or its disk is full."
 
 
@@ -420,6 +425,19 @@ def test_an_interrupt_ends_with_a_line(filmed: Path, target: Path, tmp_path: Pat
         assert process.wait(60) == 0
     text = said(printed, "cam0 20.0 Hz (100% with target), cam1 20.0 Hz (100% with target), imu0 200.0 Hz.")
     assert text.startswith("Page: http://127.0.0.1:") and "Traceback" not in text and "icalib:" not in text
+    assert f"/ Following {path}, until Ctrl-C." in text
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_quiet_prints_nothing(
+    quiet: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("icalib.tools.inspection.follow._show", interrupted)
+    follow(tmp_path / "run.mcap", None, ("127.0.0.1", 0), quiet)
+    assert ("run.mcap" in capsys.readouterr().out) != quiet
 
 
 @pytest.mark.parametrize(

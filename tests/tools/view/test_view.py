@@ -62,6 +62,7 @@ def test_the_body_moves_as_the_trajectory_does(found, shown):
     path, rows = shown.calibration.trajectory, found["world/imu0"]
     moving = np.isfinite(rows.seconds)
     np.testing.assert_allclose(rows.seconds[moving], path.seconds, atol=1e-9)
+    assert rows.seconds[moving][0] < 1.0  # the time line is in seconds from the start
     k = len(path.seconds) // 3
     np.testing.assert_allclose(rows.values["Transform3D:translation"][k][0], path.position[k], atol=1e-6)
     np.testing.assert_allclose(_matrix(rows.values["Transform3D:mat3x3"], k), path.rotation[k], atol=1e-6)

@@ -328,16 +328,16 @@ class Follower:
     """Everything that is known of a recording that is being written; `look` reads what is new. given: the target, and
     the rig if its file is a rig file.
 
-    topics: by name; sensors: topic of each sensor, the reference first; seconds: recorded time so far. Sentences:
-    problem: on the whole, "" if there is none; missing: on each sensor of the rig file without a topic; unread: on each
-    file or topic that is not read.
+    topics: by name; sensors: topic of each sensor, the reference first; seconds: recorded time so far; arrived: when
+    the last part was read, by `time.monotonic`. Sentences: problem: on the whole, "" if there is none; missing: on each
+    sensor of the rig file without a topic; unread: on each file or topic that is not read.
     """
 
     def __init__(self, root: Path, given: GivenTarget | None = None) -> None:
         self.root = root
         self.topics: dict[str, Arrivals] = {}
         self.sensors: dict[str, TopicInfo] = {}
-        self.motion, self.seconds, self.problem = Motion(), 0.0, ""
+        self.motion, self.seconds, self.arrived, self.problem = Motion(), 0.0, inf, ""
         self.missing: dict[str, str] = {}
         self.unread: dict[str, str] = {}
         self.target = given.target if given is not None and len(given.target.bodies) else None
@@ -361,6 +361,7 @@ class Follower:
             if part is not None:
                 with tempfile.TemporaryDirectory(prefix="icalib-") as folder:
                     self._take(part, part.recording(Path(folder)))
+                self.arrived = time.monotonic()  # after a search that may have waited for its compiled code
         except (OSError, RecordingError) as error:
             self.problem = str(error)
             return False
@@ -584,7 +585,7 @@ def _expected_table(prediction: Expectation) -> Grid:
 
 def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     """What is wrong, and what to do next."""
-    late = time.monotonic() - max((a.arrived for a in f.topics.values()), default=inf)
+    late = time.monotonic() - f.arrived
     if f.problem:
         yield f.problem
     yield from f.unread.values()
@@ -599,7 +600,7 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     if any(a.searched for a in cameras.values()) and not any(a.sees for a in cameras.values()):
         yield f"The target is not in view of {' and '.join(cameras)}; bring it into view."
     if prediction is None and f.topics:
-        yield "Keep moving: there is too little yet for a prediction."
+        yield _before_prediction(f)
     elif prediction is not None and prediction.problem:
         yield f"No prediction yet: {prediction.problem}"
         if f.motion.count:
@@ -610,6 +611,16 @@ def _advice(f: Follower, prediction: Expectation | None) -> Iterator[str]:
     for name, a in cameras.items():
         if a.seen and (empty := empty_borders(a.cells.tolist())):
             yield f"Move the target into the {' and the '.join(empty)} of the image of {name}."
+
+
+def _before_prediction(f: Follower) -> str:
+    """Why there is no prediction yet."""
+    cameras = [f.topics[t.name] for t in f.sensors.values() if t.kind in ("image", "corners")]
+    if not cameras:
+        return "A prediction needs a camera that sees the target: record its images, or correct the rig file."
+    if max(a.seen for a in cameras) < FEWEST_VIEWS:
+        return f"Keep moving: a prediction needs {FEWEST_VIEWS} images with the target."
+    return "Keep moving: the first prediction is on its way; the first run compiles its code."
 
 
 def _next_motion(f: Follower, prediction: Expectation) -> Iterator[str]:
@@ -644,6 +655,9 @@ def follow(root: Path, given: GivenTarget | None, address: tuple[str, int] | Non
     with closing(Page(address)) if address else nullcontext() as page, closing(Solver()) as solver:
         if page is not None:
             console.print(f"Page: http://{page.host}:{page.port}/", markup=False, highlight=False)
+            page.show(view(follower, None))
+        begins = f"Following {root}, until Ctrl-C. The first run compiles its code, which takes a minute."
+        console.print(begins, markup=False, highlight=False)
         with suppress(KeyboardInterrupt):
             _show(follower, solver, page, console)
     console.print(view(follower, solver.latest).line, markup=False, highlight=False)
