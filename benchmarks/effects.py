@@ -458,11 +458,13 @@ class Cell:
     worst: str = ""
     named: str = ""
     right: bool = False
+    at_once: bool = False  # whether the effect begins at an instant, so that a disturbance there is no wrong cause
 
     @property
     def marks(self) -> tuple[str, ...]:
         silent = self.sigmas > FAR and self.verdict != "not usable" and not self.named
-        return (*(["SILENT"] if silent else []), *(["WRONG CAUSE"] if self.named and not self.right else []))
+        wrong = self.named and not self.right and not (self.at_once and self.named.startswith("disturbance"))
+        return (*(["SILENT"] if silent else []), *(["WRONG CAUSE"] if wrong else []))
 
     @property
     def row(self) -> str:
@@ -483,7 +485,7 @@ def cell(kind: Kind, base: Scenario, effect: Outside, size: float, seed: int) ->
     for remark in dict.fromkeys((*result.reasons, *result.warnings, *estimated)):
         words = f"{remark.name}: {remark}"
         if (right := bool(re.search(effect.named, words))) or CAUSES.match(remark.name):
-            return Cell(result.verdict, sigmas, name, words, right)
+            return Cell(result.verdict, sigmas, name, words, right, effect.lasts is not None)
     return Cell(result.verdict, sigmas, name)
 
 

@@ -361,15 +361,16 @@ def _chi2_over_time(estimate: Estimate) -> dict[str, tuple[np.ndarray, np.ndarra
 
 
 def _hit_words(hit: Disturbance, timeline: Timeline) -> Remark:
-    """A sentence on a disturbance at one time."""
+    """A sentence on a disturbance at one time, of which no change of a parameter is the clear cause."""
     names = " and ".join(hit.sensors)
     part = "leave that part out"
     if timeline.can_be_cut:
-        part = f"leave that part out: --to {hit.start:.1f}, or --from {hit.end:.1f}"
+        part = f"calibrate what is before or after it: --to {hit.start:.1f}, or --from {hit.end:.1f}"
     return Remark(
         "disturbance_at_one_time",
         f"{hit.share:.0%} of the misfit ({names}) comes at one time, near "
-        f"{timeline.words(0.5 * (hit.start + hit.end))}: a shock, or wrong readings or stamps there; {part}.",
+        f"{timeline.words(0.5 * (hit.start + hit.end))}: wrong readings or stamps, a shock, or a mount, clock or "
+        f"target that changes there; {part}.",
     )
 
 

@@ -21,7 +21,14 @@ from icalib.result import ParameterGroup, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import excess, is_small, ratio, times
 from icalib.rig import Camera, Rig
-from icalib.sensors.camera.assess.lenses import ambiguities, is_far_guess, wrong_lenses, wrong_models, wrong_resolutions
+from icalib.sensors.camera.assess.lenses import (
+    ambiguities,
+    is_far_guess,
+    swapped_words,
+    wrong_lenses,
+    wrong_models,
+    wrong_resolutions,
+)
 from icalib.sensors.camera.corner_bias import centre_shifts
 from icalib.sensors.camera.corner_factor import CornerFactor
 from icalib.sensors.camera.corner_noise import NoiseModel
@@ -301,12 +308,7 @@ def swapped_cameras(cameras: Sequence[Camera], groups: Sequence[ParameterGroup])
         distances = _distance(a, estimates, a.name), _distance(b, estimates, b.name)
         crossed_distances = _distance(a, estimates, b.name), _distance(b, estimates, a.name)
         if max(distances) > FAR and max(crossed_distances) < MUCH_NEARER * max(distances):
-            sentence = Remark(
-                "cameras_swapped",
-                f"{a.name} and {b.name} seem to be swapped: the pose and lens of each fit what the rig file gives of "
-                "the other. Correct their topics or paths, or the values in the rig file.",
-            )
-            yield Cause(sentence, np.inf, True)
+            yield Cause(swapped_words(a.name, b.name), np.inf, True)
 
 
 def _distance(camera: Camera, estimates: dict[tuple[str, str], np.ndarray], name: str) -> float:

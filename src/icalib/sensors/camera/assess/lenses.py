@@ -328,31 +328,44 @@ def wrong_lenses(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -> 
     factor: the largest empirical factor, which multiplies formal standard deviations. relaxed_rig: see `relaxed`;
     nothing is tested if it is None.
     """
-    given = {c.name: c.intrinsics.value for c in inputs.rig.cameras}
-    for lens_step in _lens_steps(inputs, relaxed_rig):
-        value = given[lens_step.camera]
-        assert value is not None
-        off = np.abs(lens_step.step)
-        clearly = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * lens_step.std)
+    given = {c.name: c.intrinsics.value for c in inputs.rig.cameras if c.intrinsics.value is not None}
+    steps = _lens_steps(inputs, relaxed_rig)
+    nearest = {s.camera: _nearest(s, given) for s in steps}
+    for s in steps:
+        value, off, other = given[s.camera], np.abs(s.step), nearest[s.camera]
+        clearly, gain = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * s.std), ((s.step / s.std) ** 2).max()
         if clearly.any():
-            where = ", ".join(
-                f"{name} {old + step:.1f} and not {old:.1f}"
-                for name, old, step, far in zip(("fx", "fy", "cx", "cy"), value, lens_step.step, clearly, strict=True)
-                if far
-            )
-            nearer = [
-                n
-                for n, v in given.items()
-                if v is not None and max(abs(value + lens_step.step - v)) < NEARER * max(off)
-            ]
-            hint = f" Those of {nearer[0]} are nearer." if nearer else ""
-            sentence = Remark(
-                "fixed_intrinsics_wrong",
-                f"the intrinsics of {lens_step.camera} that the rig file fixes do not fit its images, which want "
-                f"{where}: check that they are this camera's, at this resolution, or leave them free.{hint}",
-            )
-            gain = float(((lens_step.step / lens_step.std) ** 2).max())
-            yield Cause(sentence, gain, True, tuple((lens_step.camera, name) for name in LENS))
+            swapped = other != "" and nearest.get(other) == s.camera
+            words = _wrong_words(s, value, clearly, other)
+            if swapped:
+                words = swapped_words(*sorted((s.camera, other)))
+            explained = tuple((name, part) for name in (s.camera, other) if name for part in LENS)
+            if not (swapped and other < s.camera):
+                yield Cause(words, float(gain), True, explained if swapped else explained[: len(LENS)])
+
+
+def _nearest(s: _LensStep, given: Mapping[str, np.ndarray]) -> str:
+    """The camera whose `given` intrinsics are nearest to those of the data of another; empty if none is near."""
+    wanted = given[s.camera] + s.step
+    far = {name: float(np.abs(wanted - value).max()) for name, value in given.items()}
+    name = min(far, key=lambda n: far[n])
+    return name if far[name] < NEARER * np.abs(s.step).max() else ""
+
+
+def _wrong_words(s: _LensStep, value: np.ndarray, clearly: np.ndarray, other: str) -> Remark:
+    """A sentence on fixed intrinsics `value` (4,) that contradict the data; other: the camera that they fit, or
+    empty."""
+    where = ", ".join(
+        f"{name} {old + step:.1f} and not {old:.1f}"
+        for name, old, step, far in zip(("fx", "fy", "cx", "cy"), value, s.step, clearly, strict=True)
+        if far
+    )
+    hint = f" Those of {other} are nearer." if other else ""
+    return Remark(
+        "fixed_intrinsics_wrong",
+        f"the intrinsics of {s.camera} that the rig file fixes do not fit its images, which want "
+        f"{where}: check that they are this camera's, at this resolution, or leave them free.{hint}",
+    )
 
 
 def _lens_steps(inputs: Inputs, relaxed_rig: Relaxed | None) -> tuple[_LensStep, ...]:
@@ -364,6 +377,15 @@ def _lens_steps(inputs: Inputs, relaxed_rig: Relaxed | None) -> tuple[_LensStep,
     step, std = relaxed_rig.step([(c.name, name) for c in fixed for name in LENS if getattr(c, name).mode == "fixed"])
     columns = [relaxed_rig.layout.columns(c.name, "intrinsics") for c in fixed]
     return tuple(_LensStep(c.name, step[k], std[k]) for c, k in zip(fixed, columns, strict=True))
+
+
+def swapped_words(a: str, b: str) -> Remark:
+    """A sentence on two cameras that are swapped."""
+    return Remark(
+        "cameras_swapped",
+        f"{a} and {b} seem to be swapped: what the data say of each fits what the rig file gives of the other. Correct "
+        "their topics or paths, or the values in the rig file.",
+    )
 
 
 # Whether the guess of a lens is contradicted: by projections, as single coefficients are strongly correlated.
