@@ -179,7 +179,7 @@ def rig_of(scenario: Scenario, kind: Kind) -> Rig:
     """The rig as a user writes it, who knows the noise and nothing else: with the default priors."""
     rig = rig_for(scenario, intrinsics=kind.lens, distortion=kind.lens)
     target = replace(rig.target, size_sigma=SIZE_SIGMA) if rig.has_target else rig.target
-    prior = Parameter("prior", np.zeros(24), class_imperfections(CLASS).sigma)
+    prior = Parameter("prior", np.zeros(24), class_imperfections(CLASS).sigma, of_class=True)
     assert rig.imu is not None
     return rig.with_(
         imu=replace(rig.imu, intrinsics=prior, low_pass=Parameter("fixed")) if kind.imu else None,

@@ -41,7 +41,7 @@ def test_the_change_is_that_of_a_joint_solve():
     np.testing.assert_allclose(change.step, -(inverse @ pull)[B:], rtol=1e-6)
     np.testing.assert_allclose(change.std, np.sqrt(np.diag(inverse))[B:], rtol=1e-6)
     gain = pull @ inverse @ pull - pull[:B] @ np.linalg.solve(information.sum(axis=0), pull[:B])
-    assert change.gain == pytest.approx(gain, rel=1e-6) and change.gain < tested.scatter().gain
+    assert change.gain == pytest.approx(gain, rel=1e-6) and change.gain < tested.scatter(1).gain
 
 
 def test_a_direction_that_nothing_shows_does_not_change():

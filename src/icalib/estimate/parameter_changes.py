@@ -8,8 +8,7 @@ which the trajectory of the whole recording is eliminated: that it goes on shows
 covariance, and the decrease of chi^2. A pulse, a few segments that differ, is no change, but competes with them:
 one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
 the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
-Within a segment half of it is taken to have changed. A step is tested again with short segments around it, as what
-half of a segment does not explain hides the rest."""
+Within a segment half of it is taken to have changed. Where this hides a step, shorter segments around it show it."""
 
 from __future__ import annotations
 
@@ -77,12 +76,12 @@ class Change:
 
 def least_chi2(m: int) -> float:
     """The chi^2 of m numbers that is as unlikely as SIGNIFICANT of one."""
-    return float(special.chdtri(m, special.chdtrc(1, SIGNIFICANT)))
+    return float(special.chdtri(max(m, 1), special.chdtrc(1, SIGNIFICANT)))
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """What separate parameters for each segment gain. gain: decrease of chi^2; dof: number of their
+    """What separate parameters for each segment, or pair of them, gain. gain: decrease of chi^2; dof: number of their
     directions that are determined."""
 
     gain: float
@@ -101,8 +100,9 @@ class Scatter:
 
 
 class Changes(NamedTuple):
-    """by_gain: the pattern with the largest gain for each candidate, sorted by decreasing gain; scatter: what separate
-    parameters for each segment gain."""
+    """by_gain: the pattern with the largest gain for each candidate, sorted by how much more this is than chance may
+    give so many numbers; scatter: what separate parameters for each segment gain, or for each pair
+    of them."""
 
     by_gain: tuple[Change, ...]
     scatter: Scatter
@@ -125,11 +125,13 @@ def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Change
     parts, candidates = Segments.cut(problem, state, INSTANTS), list(_candidates(problem, sensors))
     if parts is None or not candidates:
         return NO_CHANGES
-    coarse = _by_gain(parts, candidates)
-    best = coarse.by_gain[0]
-    if best.pattern == "drift" or best.gain < least_chi2(best.count):
+    coarse = _by_gain(parts, candidates, 2)
+    best, chance = coarse.by_gain[0], coarse.scatter.beyond_chance
+    may_be_clear = SHORTER * best.gain >= MIN_CHANGE_SHARE * chance and best.gain > least_chi2(best.count)
+    if best.pattern == "drift" or coarse.clear is not None or not may_be_clear:
         return coarse
-    return _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates)
+    fine = _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates, 1)
+    return coarse if fine.clear is None else fine
 
 
 def _shorter_around(second: float, parts: Segments) -> np.ndarray:
@@ -142,8 +144,8 @@ def _shorter_around(second: float, parts: Segments) -> np.ndarray:
     return np.unique(np.concatenate([short, far, ends[[0, -1]], parts.problem.chain.starts]))
 
 
-def _by_gain(parts: Segments, candidates: Sequence[Candidate]) -> Changes:
-    """The best change of each candidate, and the scatter of the segments."""
+def _by_gain(parts: Segments, candidates: Sequence[Candidate], together: int) -> Changes:
+    """The best change of each candidate, and the scatter of the segments, so many `together`."""
     form = _Form.of(parts, np.flatnonzero(np.any([c.directions.any(axis=1) for c in candidates], axis=0)))
     best_changes = []
     for candidate in candidates:
@@ -152,7 +154,7 @@ def _by_gain(parts: Segments, candidates: Sequence[Candidate]) -> Changes:
             by_pattern[change.pattern] = max(by_pattern.get(change.pattern, change), change, key=lambda c: c.gain)
         best, second, *_ = sorted(by_pattern.values(), key=lambda c: -c.gain)
         best_changes.append(replace(best, rival=second.gain))
-    return Changes(tuple(sorted(best_changes, key=lambda c: -c.gain)), form.scatter())
+    return Changes(tuple(sorted(best_changes, key=lambda c: least_chi2(c.count) - c.gain)), form.scatter(together))
 
 
 def _candidates(problem: Problem, sensors: Sequence[Sensor]) -> Iterator[Candidate]:
@@ -190,7 +192,7 @@ def _patterns(ends: np.ndarray) -> Iterator[tuple[Pattern, float, np.ndarray]]:
     for second in np.sort([*ends[1:-1], *middle[1:-1]]):  # within a segment about half of it changes
         yield "step", float(second), np.heaviside(middle - second, 0.5)
     for n in range(2, SHORTER + 1):
-        for k in range(len(middle) - n + 1):
+        for k in range(1, len(middle) - n):  # one that reaches an end of the recording is a step
             yield "pulse", float(np.mean(ends[[k, k + n]])), np.isin(np.arange(len(middle)), k + np.arange(n)) * 1.0
 
 
@@ -247,7 +249,10 @@ class _Form:
         information = np.einsum("g,gahb,h->ab", pattern, self.information, pattern, optimize=True)
         return _Solved.of(information, pattern @ self.gradient)
 
-    def scatter(self) -> Scatter:
-        """What separate parameters for each segment gain."""
-        each = _Solved.of(self.information.reshape(self.gradient.size, -1), self.gradient.ravel())
+    def scatter(self, together: int) -> Scatter:
+        """What separate parameters for each segment gain, or for so many `together`."""
+        groups = np.arange(0, len(self.gradient), together)
+        information = np.add.reduceat(np.add.reduceat(self.information, groups, axis=0), groups, axis=2)
+        gradient = np.add.reduceat(self.gradient, groups, axis=0)
+        each = _Solved.of(information.reshape(gradient.size, -1), gradient.ravel())
         return Scatter(each.gain, each.dof)

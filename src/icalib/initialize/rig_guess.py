@@ -290,8 +290,9 @@ def _without_values(rig: Rig, make: Callable[[Rig], Attempt], dropped: Callable[
 
     def bare(lens: bool) -> Rig:
         def treated(sensor: Sensor, name: str, p: Parameter) -> Parameter:
-            if p.value is None or not dropped(p) or sensor.spec(name).is_considered:
-                return p  # what a recording hardly shows explains no failure
+            if p.value is None or not dropped(p) or sensor.spec(name).is_considered or sensor is rig.imu:
+                # What a recording hardly shows explains no failure, and an IMU any: even a target of another size.
+                return p
             return Parameter("free", p.value) if lens and name in LENS else usual(sensor, name)
 
         return with_groups(rig, treated)

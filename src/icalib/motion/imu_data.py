@@ -315,8 +315,8 @@ def correction_matrices(intrinsics):
 # belongs to the clock.
 
 # Mean of readings before they are differentiated twice: white noise would be most of that, and regression on noise
-# finds too small a filter. It takes 4 % from a motion of 3 Hz.
-SMOOTH_S = 0.05
+# finds too small a filter. It takes 14 % from a motion of 3 Hz.
+SMOOTH_S = 0.1
 
 
 def reading_effect(imu: ImuData, effect: ParameterSpec, gyro_bias: np.ndarray) -> np.ndarray:

@@ -405,7 +405,7 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 
 # standard deviations from which an effect differs from zero; of several numbers: the same chance
 EFFECT_SIGMAS = SIGNIFICANT**0.5
-COVERED_SIGMAS = 2.5  # from which on standard deviations cover an effect: chance exceeds them in 1 of 80
+COVERED_SIGMAS = 3.0  # from which on standard deviations cover an effect: chance exceeds them in 1 of 370
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
@@ -481,9 +481,9 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     rates = [problem.layout.columns(*key) for key, spec in specs.items() if spec is CLOCK_RATE]
     fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
     beside = replace(problem, fixed_directions=fixed), state
-    effects = freed_estimate.effects(specs, freed)
+    effects, are_tested = freed_estimate.effects(specs, freed)
     shifts = freed_estimate.considered(specs) | freed_estimate.covered(effects)
-    return EffectsLeftOut(effects, shifts, beside)
+    return EffectsLeftOut(effects if are_tested else (), shifts, beside)
 
 
 def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
@@ -527,24 +527,24 @@ class _FreedEstimate:
     solution: Solution
     residuals: Residuals
 
-    def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[Effect, ...]:
-        """All of the effects `specs`, at one Newton step; none without segments, if one may differ from zero."""
+    def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[tuple[Effect, ...], bool]:
+        """All of the effects `specs`, at one Newton step; and whether they are tested: where one may differ from zero,
+        segments must show the standard deviations, which are else those of white noise."""
         step, root = self._step_of(np.arange(self.problem.layout.size))
         columns = {key: self.problem.layout.columns(*key) for key in specs}
         suspected = any(_is_far(step[k], root[k]) for k in columns.values())
         ratio = self._scatter(step, root, freed) if suspected else np.ones(len(step))
-        if ratio is None:
-            return ()
-        out = []
+        are_tested, ratio, out = ratio is not None, np.ones(len(step)) if ratio is None else ratio, []
         for key, k in columns.items():
             moves = float(np.abs(self._response(k) @ step[k] / self._tolerance).max(initial=0.0))
             out.append(Effect(key[0], specs[key], step[k], ratio[k, None] * root[k], _chi2(step[k], root[k]), moves))
-        return tuple(out)
+        return tuple(out), are_tested
 
     def covered(self, effects: Sequence[Effect]) -> dict[Key, np.ndarray]:
-        """(B,) changes of the calibration parameters by each effect that may differ from zero."""
+        """(B,) changes of the calibration parameters by each effect that may differ from zero, but not by those that
+        move the origin: translations are to another point, and not wrong."""
         columns = self.problem.layout.columns
-        far = (e for e in effects if _is_far(e.value, e.root))
+        far = (e for e in effects if _is_far(e.value, e.root) and not e.spec.moves_origin)
         return {(e.sensor, e.spec.name): self._response(columns(e.sensor, e.spec.name)) @ e.value for e in far}
 
     def considered(self, specs: Mapping[Key, ParameterSpec]) -> dict[Key, np.ndarray]:

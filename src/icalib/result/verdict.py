@@ -60,7 +60,7 @@ UNUSABLE = WORST_FIRST[:2]  # verdicts on components that must not be used
 TOO_UNCERTAIN = 10.0  # standard deviation in tolerances above which a component must not be used
 NULL_SPACE_SHARE = 0.25  # squared norm of a component's unit vector in the null space; unobservable above it
 MOST_NAMED = 6  # components that one sentence names
-_MOST_BY_IMU = 0.5  # share of a variance from the prior on IMU intrinsics above which a better prior is the advice
+_MOST_BY_ONE = 0.5  # share of a variance from the prior on IMU intrinsics above which a better prior is the advice
 
 
 def usability(c: Calibration) -> Usability:
@@ -157,19 +157,30 @@ def counted(c: Calibration, g: ParameterGroup) -> tuple[Verdict, ...]:
 
 def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
     """Sentences on the components that have each of `verdicts`: first those whose standard deviation comes from the
-    prior on IMU intrinsics, then all others but those that the sentence on an unobservable direction names."""
+    prior on IMU intrinsics or from effects that the estimate leaves out, then all others but those that the sentence
+    on an unobservable direction names."""
+    by_prior = f"{c.imu}.intrinsics"
     for verdict in verdicts:
-        components = [(name, by_imu) for name, v, by_imu in _components(c) if v == verdict]
-        if names := [name for name, by_imu in components if by_imu]:
+        components = [(name, source) for name, v, source in _components(c) if v == verdict]
+        of = {source: [name for name, by in components if by == source] for _, source in components}
+        what = _MEANINGS[verdict].split(";")[0]
+        for source in sorted((of.keys() & c.effects.keys()) - {""}):
+            effect = source.partition(".")[2].replace("_", " ")
+            yield Remark(
+                "effect_limits",
+                f"{named_few(of[source])}: {what}; so much of it comes from the {effect} of {source.split('.')[0]}, "
+                "which the estimate leaves out: let it be estimated.",
+            )
+        if by_prior in of and by_prior not in c.effects:
             prior = prior_words(np.array(c.rig["sensors"][c.imu]["intrinsics"]["sigma"]))
             yield Remark(
                 "imu_prior_limits",
-                f"{named_few(names)}: {_MEANINGS[verdict].split(';')[0]}; so much of it comes from the prior on IMU "
+                f"{named_few(of[by_prior])}: {what}; so much of it comes from the prior on IMU "
                 f"intrinsics {prior}. State the class of {c.imu} (`intrinsics: industrial` or "
                 "`intrinsics: tactical`), or "
                 "`intrinsics: fixed` if it is calibrated.",
             )
-        names = [name for name, by_imu in components if not by_imu]
+        names = of.get("", [])
         if verdict == "unobservable":
             names = [name for name in names if not any(name.split(" (")[0] in words for words in c.unobservable)]
         if names:
@@ -190,23 +201,29 @@ def _more(c: Calibration) -> str:
     return f"record longer, and {f'turn the rig about {axes}' if axes else 'turn about and move along every axis'}"
 
 
-def _components(c: Calibration) -> Iterator[tuple[str, Verdict, bool]]:
-    """Name with standard deviation, verdict, and whether the prior on IMU intrinsics contributes most of the variance,
-    of every component that contributes to the verdict on the result."""
+def _components(c: Calibration) -> Iterator[tuple[str, Verdict, str]]:
+    """Name with standard deviation, verdict, and what contributes most of the variance, of every component that
+    contributes to the verdict on the result: the prior on IMU intrinsics, an effect, or neither (empty)."""
+    sources = [*c.effects]
+    if c.imu is not None and "sigma" in c.rig["sensors"][c.imu].get("intrinsics", ()):  # a prior, not `fixed`
+        sources.append(f"{c.imu}.intrinsics")
     for g in c.groups:
         verdicts = counted(c, g)
         if g.name in (lens := c.lenses.get(g.sensor, ())):
             if verdicts and g.name == lens[0]:
-                yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0], False
+                yield f"{g.sensor} lens (projection {lens_projection_px(c, g.sensor):.2g} px)", verdicts[0], ""
             continue
         unit, scale = display_unit(g.unit)
-        by_imu = np.zeros(len(g.std))
-        if c.imu is not None and "sigma" in c.rig["sensors"][c.imu].get("intrinsics", ()):  # a prior, not `fixed`
-            by_imu = g.std_by.get(f"{c.imu}.intrinsics", by_imu)
-        for label, verdict, std, part in zip(g.labels, verdicts, g.std.tolist(), by_imu.tolist(), strict=False):
-            is_most = part**2 > _MOST_BY_IMU * std**2
-            size = f"{scale * part:.2g} of {scale * std:.2g} {unit}" if is_most else f"std {scale * std:.2g} {unit}"
-            yield f"{component_name(g, label)} ({size.strip()})", verdict, is_most
+        for k, (label, verdict) in enumerate(zip(g.labels, verdicts, strict=False)):
+            parts = {by: float(g.std_by[by][k]) for by in sources if by in g.std_by}
+            source, std = max(parts, key=lambda by: parts[by], default=""), float(g.std[k])
+            source = source if parts.get(source, 0.0) ** 2 > _MOST_BY_ONE * std**2 else ""
+            size = (
+                f"{scale * parts[source]:.2g} of {scale * std:.2g} {unit}"
+                if source
+                else f"std {scale * std:.2g} {unit}"
+            )
+            yield f"{component_name(g, label)} ({size.strip()})", verdict, source
 
 
 def component_name(g: ParameterGroup, label: str) -> str:

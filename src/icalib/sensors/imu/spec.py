@@ -86,6 +86,7 @@ SIZE_EFFECT = ParameterSpec(
     prior_sigma=5e-3,
     one="size_effect",
     is_effect=True,
+    moves_origin=True,
     largest=1.0,
     meaning="places of the accelerometer's y and z axes relative to that of its x axis",
 )
@@ -110,6 +111,7 @@ LOW_PASS = ParameterSpec(
     tolerance=1e-4,
     prior_sigma=1e-5,  # a Gaussian filter of 30 Hz
     least=0.0,
+    largest=1e-2,  # a filter of 0.9 Hz
     is_auxiliary=True,
     is_effect=True,
     is_considered=True,

@@ -29,6 +29,7 @@ RANGE_OFFSET = ParameterSpec(
     prior_sigma=0.03,  # range accuracy that data sheets of spinning LiDARs state, as the VLP-16's
     is_auxiliary=True,
     is_effect=True,
+    largest=1.0,
     meaning="measured less true range, the same at all ranges",
     motion="show the board nearer and farther, and walls from all sides",
 )
