@@ -232,7 +232,7 @@ class Problem:
 def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     """All priors: on the shapes of target boards, on auxiliary parameters of sensors, and `stated_priors`.
 
-    Auxiliary parameters get no verdict, such as the edge bloom of a camera. Their prior, and that of effects, is the
+    Auxiliary parameters get no verdict, such as the edge bloom of a camera. Their prior, and that of nuisances, is the
     default one, about zero, if the rig file has none.
     """
     layout = inputs.layout
@@ -241,7 +241,7 @@ def _priors(inputs: Inputs) -> tuple[Prior, ...]:
     ]
     for block in layout.free:
         stated, spec = inputs.stated(block), inputs.specs[block.key]
-        is_open = stated is not None and stated.mode != "prior" and (spec.is_auxiliary or spec.is_effect)
+        is_open = stated is not None and stated.mode != "prior" and (spec.is_auxiliary or block.is_nuisance)
         if is_open or block.name == SHEET_MIDDLE.name:
             priors.append(Prior(block, np.zeros(block.size), np.full(block.size, spec.prior_sigma)))
     return (*priors, *stated_priors(inputs))
