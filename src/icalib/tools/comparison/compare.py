@@ -533,7 +533,11 @@ def lines(comparison: Comparison) -> list[str]:
         text_lines.append(f"  {_TITLES[not d.differs]:<{width}}  {sentence(d, c)}")
     text_lines += [f"Note: {note}" for note in c.notes]
     count = sum(d.differs for d in c.differences)
-    return [*text_lines, "The same." if c.same else f"{count} of {len(c.differences)} differ."]
+    compared = len(c.differences)
+    return [
+        *text_lines,
+        f"The same in all {compared} that were compared." if c.same else f"{count} of {compared} differ.",
+    ]
 
 
 def sentence(d: Difference, c: Comparison) -> str:
