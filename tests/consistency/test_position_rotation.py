@@ -65,13 +65,11 @@ def test_a_difference_that_may_be_chance_is_covered():
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])
 def test_a_contradiction_is_said(kind):
-    rig, measured, truth = scene(kind, 2, 2.0 * TURN, 2e-3)
+    rig, measured, _ = scene(kind, 2, 2.0 * TURN, 2e-3)
     result = calibrate_measurements(rig, measured)
     (said,) = [w for w in result.warnings if w.name == "rotations_contradict_positions"]
     axis = [float(x) for x in said.split("(")[1].split(")")[0].split(", ")]
     assert np.dot(axis, TURN) > 0.9 * np.linalg.norm(TURN)
-    error = errors(result, truth, "mocap0")[0]
-    assert (np.abs(error) < 3.0 * result.group("mocap0", "rotation").std).all()
 
 
 @pytest.mark.parametrize("kind", ["absolute", "relative"])

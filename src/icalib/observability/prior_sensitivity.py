@@ -482,7 +482,8 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
     beside = replace(problem, fixed_directions=fixed), state
     effects, are_tested = freed_estimate.effects(specs, freed)
-    shifts = freed_estimate.considered(specs) | freed_estimate.covered(effects)
+    unnamed = [e for e in effects if not (are_tested and e.differs)]
+    shifts = freed_estimate.considered(specs) | freed_estimate.covered(unnamed)
     return EffectsLeftOut(effects if are_tested else (), shifts, beside)
 
 
@@ -541,10 +542,9 @@ class _FreedEstimate:
         return tuple(out), are_tested
 
     def covered(self, effects: Sequence[Effect]) -> dict[Key, np.ndarray]:
-        """(B,) changes of the calibration parameters by each effect that may differ from zero, but not by those that
-        move the origin: translations are to another point, and not wrong."""
+        """(B,) changes of the calibration parameters by each effect that may differ from zero."""
         columns = self.problem.layout.columns
-        far = (e for e in effects if _is_far(e.value, e.root) and not e.spec.moves_origin)
+        far = (e for e in effects if _is_far(e.value, e.root))
         return {(e.sensor, e.spec.name): self._response(columns(e.sensor, e.spec.name)) @ e.value for e in far}
 
     def considered(self, specs: Mapping[Key, ParameterSpec]) -> dict[Key, np.ndarray]:

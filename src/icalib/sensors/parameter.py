@@ -187,8 +187,7 @@ class ParameterSpec:
     plural, with which names of numbers begin. is_auxiliary: estimated beside the calibration, such as edge bloom, and
     without a verdict. meaning: what pages say of it. is_effect: zero of an ideal sensor; where the rig file gives no
     value, whether it is zero is tested. is_considered: all standard deviations then include the response to it, as far
-    as prior and data let it differ from zero. moves_origin: it changes the point to which translations refer.
-    starts_at_zero: needs no guess. largest: absolute value that the rig file
+    as prior and data let it differ from zero. starts_at_zero: needs no guess. largest: absolute value that the rig file
     may state, in `unit`; larger ones were meant in another. least: smallest value that a sensor can have. by_images:
     determined by images, not by motion. motion: advice if the data do not determine the group; {axes} stands for the
     axes about which the rig hardly turned. motion_on_wheels, motion_without_target and motion_at_rest replace `motion`
@@ -207,7 +206,6 @@ class ParameterSpec:
     is_auxiliary: bool = False
     is_effect: bool = False
     is_considered: bool = False
-    moves_origin: bool = False
     meaning: str = ""
     starts_at_zero: bool = False
     by_images: bool = False

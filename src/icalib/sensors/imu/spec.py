@@ -86,7 +86,6 @@ SIZE_EFFECT = ParameterSpec(
     prior_sigma=5e-3,
     one="size_effect",
     is_effect=True,
-    moves_origin=True,
     largest=1.0,
     meaning="places of the accelerometer's y and z axes relative to that of its x axis",
 )

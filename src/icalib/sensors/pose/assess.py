@@ -70,8 +70,7 @@ def causes(a: AssessedEstimate) -> Iterator[Cause]:
         sentence = (
             f"rotations and {what} of {e.sensor} contradict each other: its {what} are turned by "
             f"{np.rad2deg(angle):.2g} deg, {np.sqrt(e.chi2):.0f} standard deviations, about the axis ({axis}) of its "
-            f"{axes}; the printed standard deviations cover the difference. Write position_rotation: free, so that it "
-            "is estimated."
+            f"{axes}. Write position_rotation: free, so that it is estimated."
         )
         yield Cause(Remark("rotations_contradict_positions", sentence), e.gain)
 
