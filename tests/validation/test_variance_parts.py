@@ -5,7 +5,7 @@ import pytest
 
 from icalib.optim.arrowhead import Prior, variance_of_priors
 from icalib.optim.state import Block, State
-from icalib.validation.assess import VarianceParts
+from icalib.validation.assess import VarianceParts, with_correlations
 
 NOTHING = np.zeros(0)
 
@@ -40,3 +40,13 @@ def test_what_errors_of_a_prior_contribute_where_regressors_are_noisy():
     state = State(NOTHING, np.zeros((0, 3, 3)), empty, empty, np.zeros((0, 6)), {block.key: np.zeros(2)})
     told = variance_of_priors(np.linalg.inv(known), [prior], state)
     np.testing.assert_allclose(told, estimates.var(axis=1), rtol=0.1)
+
+
+def test_what_two_sensors_share_does_not_hide_the_noise_between_them():
+    """Noise of 1 and 2, with a factor of 5, and an error of 10 that moves both alike: their difference has noise alone."""
+    own, shared, factor = np.diag([1.0, 4.0]), np.full((2, 2), 100.0), np.array([5.0, 5.0])
+    whole = np.sqrt((factor**2 * np.diag(own) + 100.0) / (np.diag(own) + 100.0))
+    C = with_correlations(own, shared, factor, whole)
+    np.testing.assert_allclose(np.diag(C), [101.0, 104.0])
+    total = C * np.outer(whole, whole)
+    np.testing.assert_allclose(total[0, 0] + total[1, 1] - 2.0 * total[0, 1], 25.0 * 5.0)

@@ -90,7 +90,7 @@ def assess(
         *scatter_warnings(factors, segments is not None, validation),
     )
     result = dataclasses.replace(
-        _calibration(assessed, determined, observability),
+        _calibration(assessed, determined, observability, variances),
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*_notes(assessed), *size_notes, *few_segments_notes(inputs, segments)),
         cross_validation=validation,
@@ -99,13 +99,15 @@ def assess(
     return result, tuple(c.remedy for c in causes if c.remedy is not None)
 
 
-def _calibration(assessed: AssessedEstimate, determined: Determined, observability: Observability) -> Calibration:
+def _calibration(
+    assessed: AssessedEstimate, determined: Determined, observability: Observability, variances: VarianceParts
+) -> Calibration:
     """The result without warnings, notes and cross-validation."""
     inputs, timeline, estimate = assessed.inputs, assessed.timeline, determined.estimate
     outcome = estimate.outcome
     return Calibration(
         groups=assessed.groups,
-        covariance=observability.covariance,
+        covariance=_correlated(inputs, determined, variances),
         covariance_names=_column_names(inputs),
         null_space=determined.fixed_directions,
         unobservable=observability.unobservable,
@@ -232,6 +234,27 @@ def _groups(
         by = {f"{sensor}.{name}": np.sqrt(np.maximum(v[k], 0.0)) for (sensor, name), v in unseen.items()}
         groups.append(dataclasses.replace(group, std_by=by))
     return tuple(groups)
+
+
+def _correlated(inputs: Inputs, determined: Determined, variances: VarianceParts) -> np.ndarray:
+    """(B, B) formal covariance, whose correlations are those of all parts, each with the factor of its own."""
+    shifts, overall = determined.shifts, variances.pooled(calibration_columns(inputs))
+    own = dataclasses.replace(determined, shifts=shifts[:0]).covariance
+    whole, factor = np.ones(len(own)), np.ones(len(own))
+    for block in inputs.layout.free:
+        k = block.columns
+        whole[k] = np.maximum(variances.factor(k, overall), 1.0)
+        factor[k] = variances.without_shifts(k, overall)
+    return with_correlations(own, shifts.T @ shifts, factor, whole)
+
+
+def with_correlations(own: np.ndarray, shared: np.ndarray, factor: np.ndarray, whole: np.ndarray) -> np.ndarray:
+    """(n, n) sum of two covariances whose product with the factors `whole` (n,) of standard deviations is the sum of
+    `own` (n, n), with the factors `factor` (n,), and `shared` (n, n). An error of the IMU moves two cameras alike, so
+    that the noise of their relative pose keeps its factor."""
+    out = (factor[:, None] * own * factor + shared) / np.outer(whole, whole)
+    np.fill_diagonal(out, np.diag(own + shared))
+    return out
 
 
 def _group(
@@ -470,9 +493,15 @@ class VarianceParts(NamedTuple):
         pooled ratio of the group and the `overall` one, at least 1. The prior part has the square of `weight`, and the
         part from the initial guess has 1.
         """
+        shifts = np.maximum(1.0 - self.noise[columns] - self.prior[columns], 0.0)
+        return np.sqrt((1.0 - shifts) * self.without_shifts(columns, overall) ** 2 + shifts)
+
+    def without_shifts(self, columns: np.ndarray, overall: float) -> np.ndarray:
+        """(n,) factors on the part of the standard deviations that comes from noise and priors."""
         noise_factor = max(1.0, self.pooled(columns), overall)
         noise, prior = self.noise[columns], self.prior[columns]
-        return np.sqrt(noise_factor**2 * noise + self.weight**2 * prior + np.maximum(1.0 - noise - prior, 0.0))
+        square = noise_factor**2 * noise + self.weight**2 * prior
+        return np.sqrt(np.divide(square, noise + prior, out=np.ones_like(square), where=noise + prior > 0.0))
 
 
 def _empirical_variance(estimate: Estimate, segments: Segments | None, white: np.ndarray) -> np.ndarray:
