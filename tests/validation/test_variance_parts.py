@@ -43,7 +43,7 @@ def test_what_errors_of_a_prior_contribute_where_regressors_are_noisy():
 
 
 def test_what_two_sensors_share_does_not_hide_the_noise_between_them():
-    """Noise of 1 and 2, with a factor of 5, and an error of 10 that moves both alike: their difference has noise alone."""
+    """Noise of 1 and 2, with a factor of 5, and an error of 10 that moves both alike: their difference has noise."""
     own, shared, factor = np.diag([1.0, 4.0]), np.full((2, 2), 100.0), np.array([5.0, 5.0])
     whole = np.sqrt((factor**2 * np.diag(own) + 100.0) / (np.diag(own) + 100.0))
     C = with_correlations(own, shared, factor, whole)

@@ -239,21 +239,21 @@ def _groups(
 def _correlated(inputs: Inputs, determined: Determined, variances: VarianceParts) -> np.ndarray:
     """(B, B) formal covariance, whose correlations are those of all parts, each with the factor of its own."""
     shifts, overall = determined.shifts, variances.pooled(calibration_columns(inputs))
-    own = dataclasses.replace(determined, shifts=shifts[:0]).covariance
-    whole, factor = np.ones(len(own)), np.ones(len(own))
+    independent = dataclasses.replace(determined, shifts=shifts[:0]).covariance
+    whole, factor = np.ones(len(independent)), np.ones(len(independent))
     for block in inputs.layout.free:
         k = block.columns
         whole[k] = np.maximum(variances.factor(k, overall), 1.0)
         factor[k] = variances.without_shifts(k, overall)
-    return with_correlations(own, shifts.T @ shifts, factor, whole)
+    return with_correlations(independent, shifts.T @ shifts, factor, whole)
 
 
-def with_correlations(own: np.ndarray, shared: np.ndarray, factor: np.ndarray, whole: np.ndarray) -> np.ndarray:
+def with_correlations(independent: np.ndarray, shared: np.ndarray, factor: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """(n, n) sum of two covariances whose product with the factors `whole` (n,) of standard deviations is the sum of
-    `own` (n, n), with the factors `factor` (n,), and `shared` (n, n). An error of the IMU moves two cameras alike, so
+    `independent` (n, n), with the factors `factor` (n,), and `shared` (n, n). An error of the IMU moves two cameras alike, so
     that the noise of their relative pose keeps its factor."""
-    out = (factor[:, None] * own * factor + shared) / np.outer(whole, whole)
-    np.fill_diagonal(out, np.diag(own + shared))
+    out = (factor[:, None] * independent * factor + shared) / np.outer(whole, whole)
+    np.fill_diagonal(out, np.diag(independent + shared))
     return out
 
 
