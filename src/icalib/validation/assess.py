@@ -250,8 +250,8 @@ def _correlated(inputs: Inputs, determined: Determined, variances: VarianceParts
 
 def with_correlations(independent: np.ndarray, shared: np.ndarray, factor: np.ndarray, whole: np.ndarray) -> np.ndarray:
     """(n, n) sum of two covariances whose product with the factors `whole` (n,) of standard deviations is the sum of
-    `independent` (n, n), with the factors `factor` (n,), and `shared` (n, n). An error of the IMU moves two cameras alike, so
-    that the noise of their relative pose keeps its factor."""
+    `independent` (n, n), with the factors `factor` (n,), and `shared` (n, n). An error of the IMU moves two cameras
+    alike, so that the noise of their relative pose keeps its factor."""
     out = (factor[:, None] * independent * factor + shared) / np.outer(whole, whole)
     np.fill_diagonal(out, np.diag(independent + shared))
     return out
