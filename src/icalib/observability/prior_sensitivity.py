@@ -481,10 +481,9 @@ def effects_left_out(inputs: Inputs, estimate: Estimate) -> EffectsLeftOut:
     rates = [problem.layout.columns(*key) for key, spec in specs.items() if spec is CLOCK_RATE]
     fixed = _also_fixed(problem, np.concatenate([np.arange(0), *rates]))
     beside = replace(problem, fixed_directions=fixed), state
-    effects, are_tested = freed_estimate.effects(specs, freed)
-    unnamed = [e for e in effects if not (are_tested and e.differs)]
-    shifts = freed_estimate.considered(specs) | freed_estimate.covered(unnamed)
-    return EffectsLeftOut(effects if are_tested else (), shifts, beside)
+    effects = freed_estimate.effects(specs, freed)
+    shifts = freed_estimate.considered(specs) | freed_estimate.covered([e for e in effects if not e.differs])
+    return EffectsLeftOut(effects, shifts, beside)
 
 
 def _testable(inputs: Inputs) -> dict[Key, ParameterSpec]:
@@ -528,18 +527,20 @@ class _FreedEstimate:
     solution: Solution
     residuals: Residuals
 
-    def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[tuple[Effect, ...], bool]:
-        """All of the effects `specs`, at one Newton step; and whether they are tested: where one may differ from zero,
-        segments must show the standard deviations, which are else those of white noise."""
+    def effects(self, specs: Mapping[Key, ParameterSpec], freed: Inputs) -> tuple[Effect, ...]:
+        """All of the effects `specs`, at one Newton step; none where one may differ from zero and no segments show its
+        standard deviation."""
         step, root = self._step_of(np.arange(self.problem.layout.size))
         columns = {key: self.problem.layout.columns(*key) for key in specs}
         suspected = any(_is_far(step[k], root[k]) for k in columns.values())
         ratio = self._scatter(step, root, freed) if suspected else np.ones(len(step))
-        are_tested, ratio, out = ratio is not None, np.ones(len(step)) if ratio is None else ratio, []
+        if ratio is None:
+            return ()
+        out = []
         for key, k in columns.items():
             moves = float(np.abs(self._response(k) @ step[k] / self._tolerance).max(initial=0.0))
             out.append(Effect(key[0], specs[key], step[k], ratio[k, None] * root[k], _chi2(step[k], root[k]), moves))
-        return tuple(out), are_tested
+        return tuple(out)
 
     def covered(self, effects: Sequence[Effect]) -> dict[Key, np.ndarray]:
         """(B,) changes of the calibration parameters by each effect that may differ from zero."""
