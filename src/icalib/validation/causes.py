@@ -55,11 +55,9 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     omitted = {kind for a in assessments(assessed) for kind in a.unreliable}
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
-    varying: list[Cause] = []
-    if not against:
-        alone = not any_explains([c for c in stated if c.gain < np.inf], misfit)
-        varying = list(varying_causes(assessed, misfit if alone else Misfit(())))
-    known = [*stated, *varying]
+    known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
+    if not against and (drifts or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
+        known = [*stated, *varying_causes(assessed, misfit)]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
