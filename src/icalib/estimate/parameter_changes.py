@@ -36,6 +36,7 @@ SIGNIFICANT = 25.0  # gain of one parameter, five standard deviations, as many i
 LEAD = 9.0  # of gains of two patterns: three standard deviations
 INSTANTS = 16  # segments, at whose ends changes are tried
 SHORTER = 4  # parts of each segment around a change
+MOST = 0.5  # least share that a change gains with these, which are where it looks largest
 # Share that a change must gain of the gain by separate parameters for each segment. On EuRoC, where lens and board do
 # not follow the model, the best change gains 0.04.
 MIN_CHANGE_SHARE = 0.25
@@ -131,7 +132,8 @@ def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Change
     if best.pattern == "drift" or coarse.clear is not None or not may_be_clear:
         return coarse
     fine = _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates, 1)
-    return coarse if fine.clear is None else fine
+    explains = fine.clear is not None and fine.clear.gain >= MOST * max(fine.scatter.beyond_chance, chance)
+    return fine if explains else coarse
 
 
 def _shorter_around(second: float, parts: Segments) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from icalib.base.remark import Remark
 from icalib.estimate.estimate import Estimate
 from icalib.estimate.inputs import Inputs, with_association
 from icalib.motion.factor import Whitened, output_at, pairs_of
-from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor, Cause
+from icalib.observability.assessor import AssessedEstimate, Assessment, Assessor
 from icalib.optim.arrowhead import UNOBSERVABLE_BELOW, NotDefiniteError, essential_information, solve
 from icalib.result import SensorFit
 from icalib.result.calibration import Timeline, lag_one_correlation
@@ -29,8 +30,7 @@ def assess(a: AssessedEstimate) -> Assessment:
     """What results say of this kind of sensor."""
     return Assessment(
         notes=notes(a.inputs, a.estimate, a.timeline),
-        warnings=warnings(a.inputs, a.estimate),
-        causes=causes(a),
+        warnings=chain(turned_positions(a), warnings(a.inputs, a.estimate)),
     )
 
 
@@ -59,9 +59,9 @@ def _source(given: float | None) -> str:
     return "as residuals show it" if given is None else "as the rig file has it"
 
 
-def causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each pose sensor whose positions are turned against its rotations. Relative poses turn displacements
-    in the axes of the sensor."""
+def turned_positions(a: AssessedEstimate) -> Iterator[Remark]:
+    """A warning for each pose sensor whose positions are turned against its rotations: a mount that moves looks like
+    that, too, and is tested apart. Relative poses turn displacements in the axes of the sensor."""
     for e in (e for e in a.effects if e.spec is POSITION_ROTATION and e.differs):
         relative = a.inputs.sensor(e.sensor).kind == "relative"
         what, axes = ("displacements", "sensor") if relative else ("positions", "frame")
@@ -72,7 +72,7 @@ def causes(a: AssessedEstimate) -> Iterator[Cause]:
             f"{np.rad2deg(angle):.2g} deg, {np.sqrt(e.chi2):.0f} standard deviations, about the axis ({axis}) of its "
             f"{axes}. Write position_rotation: free, so that it is estimated."
         )
-        yield Cause(Remark("rotations_contradict_positions", sentence), e.gain)
+        yield Remark("rotations_contradict_positions", sentence)
 
 
 def warnings(inputs: Inputs, estimate: Estimate) -> Iterator[Remark]:
