@@ -314,8 +314,8 @@ def _contradicting_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt 
 
 
 def _has_values(rig: Rig, mode: str) -> bool:
-    """Whether the rig file gives a value with this mode."""
-    return any(p.mode == mode and p.value is not None for _, _, p in groups_of(rig))
+    """Whether the rig file gives a value with this mode that an estimate may drop."""
+    return any(p.mode == mode and p.value is not None for s, _, p in groups_of(rig) if s is not rig.imu)
 
 
 def _converged_attempt(rig: Rig, make: Callable[[Rig], Attempt]) -> Attempt | None:
