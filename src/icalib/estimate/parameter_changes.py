@@ -102,8 +102,7 @@ class Scatter:
 
 class Changes(NamedTuple):
     """by_gain: the pattern with the largest gain for each candidate, sorted by how much more this is than chance may
-    give so many numbers; scatter: what separate parameters for each segment gain, or for each pair
-    of them."""
+    give so many numbers; scatter: what separate parameters for each segment gain, or for each pair of them."""
 
     by_gain: tuple[Change, ...]
     scatter: Scatter

@@ -164,7 +164,7 @@ def _named(c: Calibration, *verdicts: Verdict) -> Iterator[Remark]:
         components = [(name, source) for name, v, source in _components(c) if v == verdict]
         of = {source: [name for name, by in components if by == source] for _, source in components}
         what = _MEANINGS[verdict].split(";")[0]
-        for source in sorted((of.keys() & c.effects.keys()) - {""}):
+        for source in sorted(of.keys() & c.effects.keys()):
             effect = source.partition(".")[2].replace("_", " ")
             yield Remark(
                 "effect_limits",

@@ -180,8 +180,8 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause
     tried = NO_CHANGES
     if assessed.segments is not None:  # beside effects, which also differ between segments
         tried = changes(*assessed.beside, assessed.inputs.sensors)
-    if effects := list(effect_causes(assessed, tried)):  # the others may follow from these
-        yield from effects
+    if drifts := list(drifting_clocks(assessed, tried)):  # the others may follow from these
+        yield from drifts
         return
     change = None if tried.clear is None else next(_change(tried, assessed, misfit), None)
     if change is not None:  # it also enlarges residuals at one time, like a disturbance
@@ -193,18 +193,18 @@ def varying_causes(assessed: AssessedEstimate, misfit: Misfit) -> Iterator[Cause
 LIKELY = 10.0  # times its usual size: a larger effect, of 500 ppm, is named only, as something else may look like it
 
 
-def effect_causes(assessed: AssessedEstimate, tried: Changes) -> Iterator[Cause]:
-    """A cause for each effect that differs from zero, with standard deviations that include the scatter of segments; or
-    that is the clear change of those `tried`, as one step leaves scatter where it is large. A clock that jumps does not
-    drift."""
+def drifting_clocks(assessed: AssessedEstimate, tried: Changes) -> Iterator[Cause]:
+    """A cause for each clock rate that differs from zero, with standard deviations that include the scatter of
+    segments; or that is the clear change of those `tried`, as one step leaves scatter where it is large. A clock that
+    jumps does not drift."""
     clear = tried.clear
     jumping = {c.sensors for c in tried.by_gain if c.name == TIME_OFFSET.name and not c.is_clock_drift}
     drifting = clear.sensors if clear is not None and clear.is_clock_drift else ()
     rig = assessed.inputs.user_rig or assessed.inputs.rig
     duration = float(np.ptp(assessed.estimate.outcome.state.seconds))
-    for e in assessed.effects:
+    for e in (e for e in assessed.effects if e.spec is CLOCK_RATE):
         rate = float(e.value[0])
-        if e.spec is CLOCK_RATE and (e.differs or e.sensor in drifting) and (e.sensor,) not in jumping:
+        if (e.differs or e.sensor in drifting) and (e.sensor,) not in jumping:
             late_s = PPM * abs(rate) * duration
             sentence = (
                 f"the clock of {e.sensor} runs about {pace_words(rate)} against that of {rig.reference}, "

@@ -332,16 +332,18 @@ def wrong_lenses(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -> 
     steps = _lens_steps(inputs, relaxed_rig)
     nearest = {s.camera: _nearest(s, given) for s in steps}
     for s in steps:
-        value, off, other = given[s.camera], np.abs(s.step), nearest[s.camera]
-        clearly, gain = off > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * s.std), ((s.step / s.std) ** 2).max()
-        if clearly.any():
-            swapped = other != "" and nearest.get(other) == s.camera
-            words = _wrong_words(s, value, clearly, other)
-            if swapped:
-                words = swapped_words(*sorted((s.camera, other)))
-            explained = tuple((name, part) for name in (s.camera, other) if name for part in LENS)
-            if not (swapped and other < s.camera):
-                yield Cause(words, float(gain), True, explained if swapped else explained[: len(LENS)])
+        value, other, gain = given[s.camera], nearest[s.camera], float(((s.step / s.std) ** 2).max())
+        clearly = np.abs(s.step) > np.maximum(OTHER_LENS * value[0], CLEARLY * factor * s.std)
+        if not clearly.any():
+            continue
+        if nearest.get(other) != s.camera:
+            yield Cause(_wrong_words(s, value, clearly, other), gain, True, _lens_keys(s.camera))
+        elif s.camera < other:  # said once of both
+            yield Cause(swapped_words(s.camera, other), gain, True, _lens_keys(s.camera, other))
+
+
+def _lens_keys(*cameras: str) -> tuple[Key, ...]:
+    return tuple((camera, name) for camera in cameras for name in LENS)
 
 
 def _nearest(s: _LensStep, given: Mapping[str, np.ndarray]) -> str:
