@@ -26,7 +26,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from icalib.data.measurements import Measurements, WheelStream
+from icalib.data.measurements import Measurements, TrackStream, WheelStream
 from icalib.errors import CalibrationError
 from icalib.geometry import so3
 from icalib.geometry.targets import AprilGrid
@@ -424,7 +424,10 @@ def recorded(kind: Kind, effect: Outside, size: float, seed: int) -> tuple[Measu
     ]
     streams = []
     for key, stream in before.measurements.streams.items():
-        parts = [_part(simulation, key, low, high) for simulation, low, high in sides]
+        parts: list[Any] = [_part(simulation, key, low, high) for simulation, low, high in sides]
+        first, second = parts[:2]
+        if isinstance(first, TrackStream) and isinstance(second, TrackStream):
+            parts[1] = _renumbered(second, after.truth.points, first, before.truth.points)
         joined = type(stream).joined([part for part in parts if len(part.stamps_ns)])
         streams.append(replace(joined, joins_ns=()))
     return Measurements.of_streams(*streams), [before, after] if effect.lasts == AT_INSTANT else [before]
@@ -446,6 +449,19 @@ def _part(simulation: Simulation, key: str, low: float, high: float) -> Stream:
     if start is not None:
         changed["start"] = np.concatenate([[0], np.cumsum(np.diff(start)[kept])])
     return replace(stream, stamps_ns=stream.stamps_ns[kept], **changed)
+
+
+def _renumbered(
+    stream: TrackStream, points: np.ndarray, earlier: TrackStream, earlier_points: np.ndarray
+) -> TrackStream:
+    """The tracks of `stream` with the numbers that their points had in `earlier`, or with new ones. points (F, 3): of
+    each feature number."""
+    if np.array_equal(points, earlier_points):
+        return stream
+    of_point = {earlier_points[number].tobytes(): number for number in np.unique(earlier.feature)}
+    new = len(earlier_points) + np.arange(len(points))
+    number = np.array([of_point.get(point.tobytes(), n) for point, n in zip(points, new, strict=True)])
+    return replace(stream, feature=number[stream.feature])
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,8 @@ which the trajectory of the whole recording is eliminated: that it goes on shows
 covariance, and the decrease of chi^2. A pulse, a few segments that differ, is no change, but competes with them:
 one bad set of images looks like a small step. Only directions that the data determine change. Gains are compared with
 the scatter of the segments that is left, as formal standard deviations are too small where the model is wrong.
-Within a segment half of it is taken to have changed. Where this hides a step, shorter segments around it show it."""
+Within a segment half of it is taken to have changed. This hides a step, or lets other parameters explain more of it, so
+that shorter segments around it decide."""
 
 from __future__ import annotations
 
@@ -70,6 +71,11 @@ class Change:
     rival: float = 0.0
 
     @property
+    def parameters(self) -> tuple[tuple[str, ...], str]:
+        """What changes: sensors, and the first of the parameters that change together."""
+        return self.sensors, self.name
+
+    @property
     def is_clock_drift(self) -> bool:
         """Whether it is the rate of a clock, which an estimate can include."""
         return self.name == TIME_OFFSET.name and self.pattern == "drift"
@@ -122,17 +128,18 @@ NO_CHANGES = Changes((), Scatter(0.0, 0.0))
 def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Changes:
     """Changes of the parameters of `sensors`. Target, planes and IMU are the reference for the others; the clock of the
     IMU is that which all others share. None is found in a recording that is too short for segments."""
-    parts, candidates = Segments.cut(problem, state, INSTANTS), list(_candidates(problem, sensors))
+    parts, candidates = Segments.between(problem, state, INSTANTS), list(_candidates(problem, sensors))
     if parts is None or not candidates:
         return NO_CHANGES
     coarse = _by_gain(parts, candidates, 2)
     best, chance = coarse.by_gain[0], coarse.scatter.beyond_chance
     may_be_clear = SHORTER * best.gain >= MIN_CHANGE_SHARE * chance and best.gain > least_chi2(best.count)
-    if best.pattern == "drift" or coarse.clear is not None or not may_be_clear:
+    if best.pattern == "drift" or not may_be_clear:
         return coarse
     fine = _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates, 1)
-    explains = fine.clear is not None and fine.clear.gain >= MOST * max(fine.scatter.beyond_chance, chance)
-    return fine if explains else coarse
+    if fine.clear is not None and fine.clear.gain >= MOST * max(fine.scatter.beyond_chance, chance):
+        return fine
+    return coarse if fine.by_gain[0].parameters == best.parameters else NO_CHANGES
 
 
 def _shorter_around(second: float, parts: Segments) -> np.ndarray:

@@ -79,6 +79,16 @@ class ChainFactor(Factor, Protocol):
         ...
 
 
+@runtime_checkable
+class TrackFactor(Factor, Protocol):
+    """Factor of points of the scene that many keyframes see, and that are eliminated with these."""
+
+    def by_segment(self, ends: np.ndarray, of_column: np.ndarray) -> TrackFactor:
+        """The same measurements, which depend on other columns in each segment. ends (G + 1,): keyframes that bound the
+        segments; of_column (G, B + 1): column in place of each calibration column, and of -1."""
+        ...
+
+
 @dataclass(frozen=True)
 class Problem:
     """Least-squares problem: minimise half the robust chi^2 of all factors and priors over a `State`. factors: one of
@@ -103,10 +113,13 @@ class Problem:
         return self.chain.n_keyframes
 
     @cached_property
-    def ties_distant_keyframes(self) -> bool:
-        """Whether a factor links keyframes that are not neighbours, so that segments of the chain are not
-        independent."""
-        return any(f.ties_distant_keyframes for f in self.factors.values())
+    def tracks(self) -> dict[FactorKey, TrackFactor]:
+        """Factors that link keyframes that are not neighbours, so that segments of the chain are not independent."""
+        return {key: f for key, f in self.factors.items() if isinstance(f, TrackFactor)}
+
+    def without_tracks(self) -> Problem:
+        """The same problem without these."""
+        return replace(self, factors={key: f for key, f in self.factors.items() if key not in self.tracks})
 
     def replacing(self, factors: Sequence[Factor]) -> Problem:
         """The same problem with `factors` instead of those with the same keys; factors with new keys are added."""
@@ -149,7 +162,7 @@ class Problem:
         """System (B + 1, B + 1) of the calibration parameters and their gradient, all keyframes eliminated. sums_of:
         makes the sums between two keyframes. To bound memory, segments are eliminated in turn unless factors link
         distant keyframes."""
-        if self.ties_distant_keyframes:
+        if self.tracks:
             return marginalise(sums_of(0, self.n_keyframes - 1))
         return marginalise_in_segments(sums_of, self.n_keyframes)
 

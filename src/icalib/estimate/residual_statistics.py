@@ -98,7 +98,7 @@ class PieceGradient(NamedTuple):
         """The gradient in the sums of `piece`, before it is eliminated, or its `columns`."""
         return cls(piece.first, piece.side[:, :, columns].copy(), piece.calib[:-1, columns].copy())
 
-    def add(self, piece: Piece, columns: int | slice) -> bool:
+    def add(self, piece: Piece, columns: int | np.ndarray) -> bool:
         """Adds the gradient to `columns` of `piece`. A keyframe that two pieces share counts in the earlier one, the
         calibration parameters in the piece of the segment's first keyframe. Returns whether it is this."""
         first = piece.first + (piece.first > 0)
@@ -133,9 +133,10 @@ class Segments:
     def of(cls, problem: Problem, outcome: Outcome, count: int) -> Segments | None:
         """About `count` segments of similar length, at least one per recording. None if they would be too short, or if
         one cannot be solved alone."""
-        if (parts := cls.cut(problem, outcome.state, count)) is None:
+        if (parts := cls.between(problem, outcome.state, count)) is None:
             return None
         ends = parts.ends
+        parts = replace(parts, problem=problem.cut(outcome.state, ends[:-1]))
         scratch = parts.problem.reusable_output(outcome.residuals)
         try:
             gradients, sums = zip(*in_parallel(lambda g: parts.alone(g, scratch), range(len(ends) - 1)), strict=True)
@@ -146,8 +147,8 @@ class Segments:
         return replace(parts, sums=np.array(sums), gradients=joint[:B, B:-1].T, information=joint[:B, :B])
 
     @classmethod
-    def cut(cls, problem: Problem, state: State, count: int) -> Segments | None:
-        """As `of`, without sums."""
+    def between(cls, problem: Problem, state: State, count: int) -> Segments | None:
+        """As `of`, without sums, and with whole tracks."""
         count, fewest = _as_many_as_stand_alone(problem, count)
         if count < 2:
             return None
@@ -158,8 +159,8 @@ class Segments:
 
     @classmethod
     def at(cls, problem: Problem, state: State, ends: np.ndarray) -> Segments:
-        """Segments bounded by the keyframes `ends` (G + 1,), without sums."""
-        return cls(problem.cut(state, ends[:-1]), state, ends, *[np.zeros(0)] * 3)
+        """Segments bounded by the keyframes `ends` (G + 1,), without sums, and with whole tracks."""
+        return cls(problem, state, ends, *[np.zeros(0)] * 3)
 
     @property
     def count(self) -> int:
@@ -202,28 +203,35 @@ class Segments:
         """Information (n, n) and gradient (n,) of the B calibration parameters and, in each segment, of a further part
         of m of them, those with `columns`; n = B + G m. The joint trajectory is eliminated, priors are included."""
         problem, state, B, m = self.problem, self.state, self.problem.layout.size, len(columns)
+        own, plain = B + np.arange(self.count * m).reshape(self.count, m), problem.without_tracks()
         scratch, n = problem.residuals(), B + self.count * m
+        of_column = np.tile(np.append(np.arange(B), -1), (self.count, 1))
+        of_column[:, columns] = own
+        tracks = [(key, f.by_segment(self.ends, of_column)) for key, f in problem.tracks.items()]
 
         def columns_of(g: int) -> tuple[PieceGradient, PieceGradient]:
-            piece = self.piece(g, scratch)
+            piece = replace(self, problem=plain).piece(g, scratch)
             return PieceGradient.of(piece, columns), PieceGradient.of(piece)
 
         of_segments = in_parallel(columns_of, range(self.count))
 
         def piece_between(first: int, last: int) -> Piece:
-            piece = problem.piece_with_columns(state, first, last, n + 1 - B, scratch)
-            for at, (repeated, gradient) in zip(range(B, n, m), of_segments, strict=True):
-                part = slice(at, at + m)
+            piece = plain.piece_with_columns(state, first, last, n - B, scratch)
+            for part, (repeated, gradient) in zip(own, of_segments, strict=True):
                 if repeated.add(piece, part):
-                    piece.calib[part, part] += repeated.calib[columns]
+                    piece.calib[np.ix_(part, part)] += repeated.calib[columns]
                     piece.calib[part, n] += gradient.calib[columns]
                 gradient.add(piece, n)
-            if piece.features is not None:
-                piece.features.repeat(columns, self.ends - piece.first, B)
+            piece.side[:, :, columns] = piece.calib[columns] = piece.calib[:, columns] = 0.0  # all are in segments
+            for key, factor in tracks:
+                piece = factor.attach(piece, False)
+                factor.accumulate(state, piece, scratch[key])
             return piece
 
-        whole = problem.marginal(piece_between)[:-1, :-1]
+        whole = problem.marginal(piece_between)
         whole = np.triu(whole) + np.triu(whole, 1).T
+        whole[columns] = whole[own].sum(axis=0)
+        whole[:, columns] = whole[:, own].sum(axis=1)
         information, gradient = whole[:-1, :-1], whole[:-1, -1]
         _, pull, known = sums_of_priors(problem.priors, state, B)
         information[:B, :B] += known

@@ -77,12 +77,10 @@ class StateDifference(NamedTuple):
 class Factor(Protocol):
     """All measurements of one kind by one sensor. `accumulate` fills arrays of a class that the factor chooses.
 
-    is_sparse: one keyframe alone has too few rows to determine the calibration. ties_distant_keyframes: rows share
-    eliminated parameters, such as points of the scene, so that segments of the chain are not independent.
+    is_sparse: one keyframe alone has too few rows to determine the calibration.
     """
 
     is_sparse: ClassVar[bool]
-    ties_distant_keyframes: ClassVar[bool]
 
     @property
     def key(self) -> FactorKey: ...
@@ -152,7 +150,6 @@ class FactorDefaults:
     """Defaults for factors that depend on neighbouring keyframes only, and have no eliminated parameters."""
 
     is_sparse: ClassVar[bool] = False
-    ties_distant_keyframes: ClassVar[bool] = False
 
     def with_imu(self, imu: ImuData, state: State) -> Self:
         """See `Factor`; nothing is preintegrated."""

@@ -76,9 +76,10 @@ def contradictions(inputs: Inputs, relaxed_rig: Relaxed | None, factor: float) -
     significant = _significant(one_freed)
     if not significant:
         return ()
-    if any(c.in_prior_sigmas > FAR for c in significant):
+    linear = _significant(_linear(inputs, relaxed_rig, significant, factor))
+    if linear and any(c.in_prior_sigmas > FAR for c in significant):
         return _significant(_estimated(inputs, relaxed_rig.state, significant))
-    return _significant(_linear(inputs, relaxed_rig, significant, factor))
+    return linear
 
 
 def _significant(differences: Sequence[Contradiction]) -> tuple[Contradiction, ...]:

@@ -40,16 +40,6 @@ class PieceFeatures:
         wide[:, :, : side.shape[2] - 1] = side[:, :, :-1]
         return PieceFeatures.of(self.sums._replace(side=wide), self.plan)
 
-    def repeat(self, columns: np.ndarray, ends: np.ndarray, first: int) -> None:
-        """Copies `columns` (m,) of each feature to those of its segment, which begin at `first` + m g. ends (G + 1,):
-        keyframes between which all images of a feature are."""
-        sums, m = self.sums, len(columns)
-        segment = np.zeros(len(sums.side), dtype=np.int64)
-        segment[sums.track] = np.searchsorted(ends[1:-1], sums.keyframe[sums.image], side="right")
-        for g in range(len(ends) - 1):
-            features = segment == g
-            sums.side[features, :, first + m * g : first + m * (g + 1)] = sums.side[features][:, :, columns]
-
 
 @dataclass(frozen=True)
 class Eliminated:

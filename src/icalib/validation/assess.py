@@ -507,7 +507,7 @@ class VarianceParts(NamedTuple):
 def _empirical_variance(estimate: Estimate, segments: Segments | None, white: np.ndarray) -> np.ndarray:
     """(B,) variances: the larger of the scatter over segments and over feature tracks. The excess of cluster-robust
     variances over `white` (B,) is added, for image and target regions. Returns `white` without segments and tracks."""
-    if segments is None and not estimate.problem.ties_distant_keyframes:
+    if segments is None and not estimate.problem.tracks:
         return white
     clusters = cluster_covariances(estimate.problem, estimate.outcome)
     spread = white if clusters.tracks is None else np.diag(clusters.tracks)

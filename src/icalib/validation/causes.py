@@ -268,9 +268,11 @@ def _changed(c: Change, problem: Problem, state: State) -> tuple[Remark, str]:
         size = Remark("wheel_sizes_change", sentence)
         return size, "Check tyres, load and encoders."
     turn, move = _sizes(problem.layout, c)
-    return Remark(
-        "mount_moves", f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm"
-    ), "Fasten all mounts."
+    moves, advice = f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm", "Fasten all mounts."
+    if c.name == "translation":  # of an antenna: the two are hard to tell apart
+        moves = f"it moves on its mount by {1e3 * move:.2g} mm, or its positions jump"
+        advice = "Fasten all mounts, and leave out fixes of a low status (least_status)."
+    return Remark("mount_moves", moves), advice
 
 
 def _clock_words(c: Change, others: list[str], when: str, timeline: Timeline) -> Remark:

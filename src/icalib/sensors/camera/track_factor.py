@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
 
 import numpy as np
 
@@ -81,7 +80,8 @@ class FeatureFactor(FactorDefaults):
     cameras: corner factors, which have the camera poses and models. For each camera: streams, with the same images as
     its corners; noise; keep (N,) bool: observations in use; outliers (N,) bool, an empty tuple if not yet tested. loss,
     loss_scale: robust loss and its threshold in sigma. seams: first keyframe of each recording but the first;
-    surfaces: planes that points may lie on. `cut` gives the tracks, and `on`, the plane of each track."""
+    surfaces: planes that points may lie on. `cut` gives the tracks, and `on`, the plane of each track. segments: see
+    `by_segment`."""
 
     cameras: tuple[CornerFactor, ...]
     streams: tuple[TrackStream, ...]
@@ -95,8 +95,7 @@ class FeatureFactor(FactorDefaults):
     outliers: tuple[np.ndarray, ...] = ()
     tracks: Tracks = NO_TRACKS
     on: OnPlanes = NO_PLANES
-
-    ties_distant_keyframes: ClassVar[bool] = True
+    segments: tuple[np.ndarray, np.ndarray] | None = None
 
     @property
     def name(self) -> str:
@@ -195,6 +194,10 @@ class FeatureFactor(FactorDefaults):
             tuple(np.zeros((n, 2)) for n in sizes), tuple(np.zeros(n) for n in sizes), np.zeros((points, 3)),
             PlaneDistances.zeros(points),
         )  # fmt: skip
+
+    def by_segment(self, ends: np.ndarray, of_column: np.ndarray) -> FeatureFactor:
+        """See `TrackFactor`."""
+        return replace(self, segments=(ends, of_column))
 
     def with_imu(self, imu: ImuData, state: State) -> FeatureFactor:
         return replace(self, cameras=tuple(c.with_imu(imu, state) for c in self.cameras))
@@ -337,16 +340,20 @@ class FeatureFactor(FactorDefaults):
     def _view(self, state: State, index: int, images: range, first: int) -> CameraImages:
         camera, stream, tracks = self.cameras[index], self.streams[index], self.tracks
         i0, i1 = images.start, images.stop
+        keyframe = camera.keyframe[i0:i1]
         observed = TrackObservations(
             stream.start[i0 : i1 + 1], stream.uv, self.keep[index], tracks.track[index], tracks.pair[index],
-            camera.keyframe[i0:i1] - first, self.sigmas[index],
+            keyframe - first, self.sigmas[index],
         )  # fmt: skip
         lens = self.layout.columns(camera.name, "intrinsics", "distortion")
         pars = np.flatnonzero(lens >= 0)
         clocks = range(len(state.values[camera.name, "time_offset"]))
         direct = np.concatenate([lens[pars], camera.readout_columns])
         columns_of_clocks = np.array([np.concatenate([camera.kinematics.columns(k), direct]) for k in clocks])
-        columns, rows = columns_of_clocks[clock_numbers(state, camera.name, camera.keyframe[i0:i1])], None
+        columns, rows = columns_of_clocks[clock_numbers(state, camera.name, keyframe)], None
+        if self.segments is not None:
+            ends, of_column = self.segments
+            columns = of_column[np.searchsorted(ends[1:-1], keyframe, side="right")[:, None], columns]
         if camera.shutter is not None:
             seen, image = slice(*observed.start[[0, -1]].tolist()), np.repeat(images, np.diff(observed.start))
             rows = camera.rows_of(state, image, stream.uv[seen])

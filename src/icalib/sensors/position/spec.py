@@ -58,8 +58,7 @@ class PositionSensor(ClockedSensor):
     parameters: ClassVar[tuple[ParameterSpec, ...]] = (TRANSLATION, TIME_OFFSET, CLOCK_RATE)
     readings: ClassVar[str] = "positions"
     gives_motion: ClassVar[bool] = True
-    # Not its translation: an antenna that moves cannot be told from fixes that jump, as float solutions do.
-    may_change: ClassVar[tuple[tuple[str, ...], ...]] = ((TIME_OFFSET.name,),)
+    may_change: ClassVar[tuple[tuple[str, ...], ...]] = ((TIME_OFFSET.name,), (TRANSLATION.name,))
 
     path: str
     coordinates: Coordinates | None = None
