@@ -244,10 +244,6 @@ class Segments:
         alone = self.sums[:, :-1, :-1]
         return alone + (self.information - alone.sum(axis=0)) / self.count
 
-    def after(self, step: np.ndarray) -> Segments:
-        """The segments with the gradients that the linear step (B,) leaves."""
-        return replace(self, gradients=self.gradients + self.known @ step)
-
     def cost(self, g: int, state: State, out: Residuals) -> float:
         """Half the robust chi^2 of segment `g` at `state`; fills `out` with its residuals."""
         piece = Piece.bare(int(self.ends[g]), int(self.ends[g + 1]))

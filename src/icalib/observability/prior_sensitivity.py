@@ -406,6 +406,7 @@ def _in_layout(layout: Layout, before: Layout, fixed_directions: np.ndarray) -> 
 # standard deviations from which an effect differs from zero; of several numbers: the same chance
 EFFECT_SIGMAS = SIGNIFICANT**0.5
 COVERED_SIGMAS = 3.0  # from which on standard deviations cover an effect: chance exceeds them in 1 of 370
+SHORTLY = 0.01  # of a step: over it the gradients of segments are linear
 WIDE = 1e3  # of a prior: instead of none, as the motion need not show an effect
 
 
@@ -590,22 +591,38 @@ class _FreedEstimate:
     def _scatter(self, step: np.ndarray, root: np.ndarray, freed: Inputs) -> np.ndarray | None:
         """(B,) ratios of standard deviations, by the scatter of segments after `step` and by white noise; at least that
         of all parameters that matter together. None without segments."""
-        outcome = outcome_of(Linearised(self.problem, self.state, 0.0, self.residuals), 0.0, [], self.solution)
-        if (parts := Segments.of(self.problem, outcome, freed.rig.settings.segments)) is None:
+        before, shortly = self._segments(step, 0.0, freed), self._segments(step, SHORTLY, freed)
+        if before is None or shortly is None:
             return None
-        scattered = spread_variance(outcome, parts.after(step), noise_variance(self.problem, outcome))
+        gradients = before.gradients + (shortly.gradients - before.gradients) / SHORTLY
+        outcome = self._outcome(self.state)
+        white = noise_variance(self.problem, outcome)
+        scattered = spread_variance(outcome, replace(before, gradients=gradients), white)
         variance, ratio = (root**2).sum(axis=1), np.ones(len(step))
         np.divide(scattered, variance, out=ratio, where=variance > 0.0)  # 0: fixed
         ratio = np.sqrt(np.maximum(ratio, 1.0))
         return np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))
 
+    def _segments(self, step: np.ndarray, share: float, freed: Inputs) -> Segments | None:
+        """Segments after a share of `step`, which trajectory and points follow."""
+        factors = self.solution.factors
+        chain = factors.back(np.append(step, 1.0)[:, None], [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
+        state = self.state.retract(self.problem.layout, share * chain, share * step)
+        return Segments.of(self.problem, self._outcome(state), freed.rig.settings.segments)
+
+    def _outcome(self, state: State) -> Outcome:
+        """The outcome at another state."""
+        return outcome_of(Linearised(self.problem, state, 0.0, self.residuals), 0.0, [], self.solution)
+
 
 def _is_far(step: np.ndarray, root: np.ndarray) -> bool:
-    """Whether `step` (m,), whose covariance has the root (m, n), differs from zero by COVERED_SIGMAS along a principal
-    direction; of several by what is as unlikely."""
+    """Whether `step` (m,), whose covariance has the root (m, n), differs from zero by what is as unlikely as
+    COVERED_SIGMAS of one number: as a whole, or along a principal direction. Priors hide one direction of many."""
     values, vectors = np.linalg.eigh(root @ root.T)
-    least = special.chdtri(1, special.chdtrc(1, COVERED_SIGMAS**2) / len(step))
-    return bool(((vectors.T @ step) ** 2 > least * np.maximum(values, 1e-12 * values[-1])).any())
+    squares = (vectors.T @ step) ** 2 / np.maximum(values, 1e-12 * values[-1])
+    chance = special.chdtrc(1, COVERED_SIGMAS**2)
+    m = len(step)
+    return bool(squares.sum() > special.chdtri(m, chance) or squares.max() > special.chdtri(1, chance / m))
 
 
 def _chi2(step: np.ndarray, root: np.ndarray) -> float:
