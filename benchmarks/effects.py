@@ -259,7 +259,7 @@ UNSHOWN = 3.0  # standard deviations of the prior of a length that nothing else 
 # Identifiers of sentences that name a cause; all others say that numbers are uncertain, or describe residuals.
 CAUSES = re.compile(
     r"clock_(drifts|rate_estimated|jumps)|imu_not_ideal|imu_noise_(under|over)stated|ranges_contradict|range_\w+_estimated"
-    r"|rolling_\w+|cameras_\w+|mount_moves|lens_\w+|wheel_sizes_\w+|disturbance_at_one_time|target_size_wrong"
+    r"|ring_errors_\w+|rolling_\w+|cameras_\w+|mount_moves|lens_\w+|wheel_sizes_\w+|disturbance_at_one_time|target_size_wrong"
     r"|(fixed_value|prior|guess|lengths|rotations)_contradict\w*|fixed_intrinsics_wrong|resolution_wrong|second_lens_fits"
     r"|accelerometer_\w+|imu_\w+_estimated|target_moves|ground_not_even|poses_filtered_or_drifting|scan_\w+|many_outliers\w*"
 )
@@ -309,11 +309,11 @@ def _bumped(T: np.ndarray, angle: float) -> np.ndarray:
     return moved
 
 
-def _rings(lidar: SimLidar, size_deg: float) -> tuple[float, ...]:
-    """Errors of the elevations of rings, the same in each recording, of that RMS size."""
+def _rings(lidar: SimLidar, size: float) -> tuple[float, ...]:
+    """Errors of rings, the same in each recording, of that RMS size."""
     off = np.random.default_rng(5).standard_normal(lidar.rings)
     off -= off.mean()
-    return tuple(size_deg * off / np.sqrt(np.mean(off**2)))
+    return tuple(size * off / np.sqrt(np.mean(off**2)))
 
 
 def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
@@ -373,7 +373,9 @@ def _of_lidar(lidar: SimLidar) -> Iterator[Outside]:
     scale = _with(lidar.name, scale=lambda _, x: 1.0 + x)
     yield Outside("range scale", 1e-3, 0.03, "", "range_scale_estimated|ranges_contradict", scale)
     rings = _with(lidar.name, elevation_errors_deg=lambda _, x: _rings(lidar, x))
-    yield Outside("elevations of rings", 0.1, 0.5, "deg", "ring", rings)
+    yield Outside("elevations of rings", 0.1, 0.5, "deg", "ring_elevations", rings)
+    offsets = _with(lidar.name, ring_offsets_m=lambda _, x: _rings(lidar, x))
+    yield Outside("offsets of rings", 0.01, 0.04, "m", "ring_offsets", offsets)
 
 
 def _of_imu() -> Iterator[Outside]:

@@ -24,7 +24,7 @@ from icalib.model.bodies import SIZE, Bodies
 from icalib.motion.factor import keyed
 from icalib.motion.imu_data import ImuData
 from icalib.motion.poses import MIDDLE, EstimatedMotion, assign_keyframes, place_keyframes
-from icalib.optim.arrowhead import Piece, make_pieces
+from icalib.optim.arrowhead import Piece, Prior, make_pieces
 from icalib.optim.state import KEYFRAME_DIM, Entry, Kind, Layout, State, make_layout
 from icalib.rig import ImuSensor, Lidar, Scheme, Settings
 from icalib.rig.scene import SHAPE_LABELS
@@ -44,6 +44,8 @@ from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenari
 TOLERANCE = {
     "range_offset": 5e-3,
     "range_scale": 1e-2,
+    "ring_elevations": 2e-3,
+    "ring_offsets": 5e-3,
     "gravity": 0.01,
     "rotation": 2e-3,
     "translation": 5e-3,
@@ -334,14 +336,24 @@ class RoomSetup:
         lidar = self.factor(start, noise, **options)
         sensors = ImuSensor("imu0", "", class_noise("consumer")), Lidar(self.stream.name, "")
         tolerance = tolerance_of(self.layout, specs_of(self.layout, sensors), Settings())
-        return Problem(self.layout, keyed((imu, lidar)), (), tolerance, framed=False)
+        # One ring has no offset of its own, so that nothing but a prior holds that number.
+        offsets = (b for b in self.layout.free if b.name == "ring_offsets")
+        priors = tuple(Prior(b, np.zeros(b.size), np.full(b.size, 10.0)) for b in offsets)
+        return Problem(self.layout, keyed((imu, lidar)), priors, tolerance, framed=False)
 
 
 def make_room(
-    sim: Simulation, *, imu_free: bool = False, spacing: float = 0.025, sheet: bool = False, drifts: bool = False
+    sim: Simulation,
+    *,
+    imu_free: bool = False,
+    spacing: float = 0.025,
+    sheet: bool = False,
+    drifts: bool = False,
+    rings: bool = False,
 ) -> RoomSetup:
     """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on. sheet: the floor
-    is the sheet of a target at the origin of the world; drifts: the rate of the clock is estimated."""
+    is the sheet of a target at the origin of the world; drifts: the rate of the clock is estimated; rings: the
+    elevations of its rings are."""
     truth, stream = sim.truth, sim.measurements.lidars[0]
     imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
     count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))
@@ -358,6 +370,7 @@ def make_room(
     entries.append((stream.name, "clock_rate", "vector", 1, drifts))
     entries.append((stream.name, "range_offset", "vector", 1, sheet))
     entries.append((stream.name, "range_scale", "vector", 1, sheet or drifts))
+    entries.extend((stream.name, name, "vector", 16, rings) for name in ("ring_elevations", "ring_offsets"))
     if sheet:
         assert used[0] == 0, "the first face of a room is its floor"
         planes = ((BOARD, "tilt"), *planes[1:])
@@ -371,6 +384,7 @@ def make_room(
     }
     values |= {(stream.name, name): np.zeros(1) for name in ("range_offset", "range_scale", "clock_rate")}
     values[stream.name, MIDDLE] = stream.seconds[-1:] / 3.0
+    values |= {(stream.name, name): np.zeros(16) for name in ("ring_elevations", "ring_offsets")}
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
     faces = not_none(sim.scenario.room).faces
     for key, k in zip(planes, used, strict=True):

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from types import ModuleType
+from typing import Literal
 
 import numpy as np
 import pytest
+from scipy import stats
 from tests.typed import not_none
 
 from icalib.pipeline import calibrate_measurements
@@ -186,6 +188,57 @@ def test_an_offset_of_ranges_is_found(program: ModuleType, offset_m: float):
         tested = result.effects["lidar0.range_offset"]
         assert abs(tested["value"][0]) < 5.0 * tested["std"][0] < 0.01
     assert max(off for _, verdict, off in program.errors(result, simulation) if verdict == "determined") < 4.0
+
+
+@pytest.mark.parametrize(("rig_type", "mode"), [("LiDAR + IMU", "free"), ("LiDAR + poses + IMU", "fixed")])
+def test_elevations_of_rings_are_found(program: ModuleType, rig_type: str, mode: Literal["free", "fixed"]):
+    """0.2 deg RMS, whether the rig file asks for them or not. A mount that moves was named, and the result was not
+    usable."""
+    kind, off = program.KINDS[rig_type], 0.2 * np.random.default_rng(6).standard_normal(16)
+    scenario = kind.scenario()
+    lidars = (replace(x, azimuth_steps=225, elevation_errors_deg=tuple(off)) for x in scenario.of(SimLidar))
+    scenario = scenario.with_sensors(*lidars)
+    simulation = simulate(scenario, 1)
+    rig = program.rig_of(scenario, kind)
+    rig = rig.with_(lidars=tuple(replace(x, ring_elevations=Parameter(mode)) for x in rig.lidars))
+    result = calibrate_measurements(rig, simulation.measurements.unassociated())
+    assert result.verdict.startswith("usable")
+    assert [str(note)[:15] for note in result.notes if note.name == "ring_errors_estimated"] == ["ring elevations"]
+    rings = result.group("lidar0", "ring_elevations")
+    error = rings.value - np.deg2rad(off)
+    covariance = result.covariance[np.ix_(not_none(rings.columns), not_none(rings.columns))]
+    assert stats.chi2.sf(error @ np.linalg.solve(covariance, error), 16) > 1e-3
+    assert rings.std.max() < np.deg2rad(0.01)
+    assert max(x for _, verdict, x in program.errors(result, simulation) if verdict == "determined") < 4.0
+
+
+def test_offsets_of_rings_are_found(program: ModuleType):
+    """2 cm RMS, together with the offset of the ring that has none of its own; elevations are right."""
+    kind, off = program.KINDS["LiDAR + IMU"], 0.02 * np.random.default_rng(7).standard_normal(16) + 0.01
+    scenario = kind.scenario()
+    lidars = (replace(x, azimuth_steps=225, ring_offsets_m=tuple(off)) for x in scenario.of(SimLidar))
+    scenario = scenario.with_sensors(*lidars)
+    simulation = simulate(scenario, 1)
+    result = calibrate_measurements(program.rig_of(scenario, kind), simulation.measurements.unassociated())
+    assert result.verdict.startswith("usable")
+    assert [str(note)[:12] for note in result.notes if note.name == "ring_errors_estimated"] == ["ring offsets"]
+    rings, offset = result.group("lidar0", "ring_offsets"), result.group("lidar0", "range_offset")
+    assert np.abs(rings.value + offset.value - off).max() < 4e-3
+    assert max(x for _, verdict, x in program.errors(result, simulation) if verdict == "determined") < 4.0
+
+
+@pytest.mark.parametrize("rig_type", ["LiDAR + IMU", "LiDAR + poses + IMU"])
+def test_right_rings_are_left_alone(program: ModuleType, rig_type: str):
+    kind = program.KINDS[rig_type]
+    scenario = kind.scenario()
+    scenario = scenario.with_sensors(*(replace(x, azimuth_steps=225) for x in scenario.of(SimLidar)))
+    measured = simulate(scenario, 1).measurements.unassociated()
+    result = calibrate_measurements(program.rig_of(scenario, kind), measured)
+    for name, most in (("ring_elevations", np.deg2rad(0.01)), ("ring_offsets", 2e-3)):
+        tested = result.effects[f"lidar0.{name}"]
+        assert (np.abs(tested["value"]) < 4.0 * np.array(tested["std"])).all()
+        assert sorted(tested["std"])[-2] < most  # one ring has no offset of its own
+    assert not any("ring" in remark.name for remark in (*result.reasons, *result.notes))
 
 
 @pytest.mark.full

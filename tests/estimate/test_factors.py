@@ -46,6 +46,7 @@ from icalib.sensors.imu.residual import ImuFactor
 from icalib.sensors.lidar.binning import LidarNoise
 from icalib.sensors.lidar.board_factor import ON_BOARDS, ON_EDGES, BoardFactor, BoardPoints
 from icalib.sensors.lidar.patch_factor import PatchFactor, PatchPoints, PatchRows
+from icalib.sensors.lidar.residual import ring_errors
 from icalib.sensors.pose.residual import AbsolutePoseFactor, PoseNoise, RelativePosesFactor, frame_of
 from icalib.sensors.position.residual import OffsetWalkFactor, PositionFactor, PositionNoise, knot_entries
 from icalib.sensors.position.stream import PositionStream
@@ -407,10 +408,12 @@ def lidar_sample(
     restarts=False,
     noisy=1.0,
     sheet=False,
+    rings=False,
 ):
     """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
-    that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target."""
-    setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet, drifts=True)
+    that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target. rings: the elevations of
+    rings are free."""
+    setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet, drifts=True, rings=rings)
     setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:
         stream = replace(setup.stream, joins_ns=(int(setup.stream.stamps_ns[2]),))
@@ -425,12 +428,23 @@ def lidar_sample(
         out = factor.output()
         for piece in make_pieces(len(at.seconds), setup.layout.size):
             factor.accumulate(at, piece, out, sums=False)
-        return out.residual.ravel()
+        return np.append(out.residual.ravel(), beside_rows @ by_rings(at))
 
     def accumulate(at, piece, sums):
         return factor.accumulate(at, piece, factor.output(), sums)
 
-    walks = lidar_walks(factor, start)
+    def by_rings(at):
+        return (ring_errors(at, "lidar0") - ring_errors(start, "lidar0"))[:n_rings]
+
+    walks, of_rings = lidar_walks(factor, start), factor.moments.rings.astype(np.float64)
+    n_rings = of_rings.shape[1]
+    # What the points have beyond the four rows of their entry, of which no pose knows.
+    products = of_rings[:, :, 5:].sum(axis=0).T  # by the second error, of the first
+    same_ring = np.tile(np.eye(16), (2, 2)) if rings else np.zeros((0, 0))
+    beyond = same_ring * np.repeat(products, 16, axis=0)[:n_rings]
+    beyond = beyond - np.einsum("ekc,elc->kl", of_rings[:, :, :4], of_rings[:, :, :4])
+    squares, axes = np.linalg.eigh(beyond)  # of bands without a ring 0
+    beside_rows = np.sqrt(np.maximum(squares, 0.0))[:, None] * axes.T
 
     def weights(at):
         """Of rows that the gyroscope's noise moves together, on each side of a keyframe; what it explains by slanted
@@ -443,7 +457,8 @@ def lidar_sample(
 
     def turned(at):
         unturned = np.zeros((len(factor.keyframe), 3))
-        return factor.moments.incidence[:, 0].sum() + lidar_rows_turned(factor, at, unturned)[1].sum()
+        slanted = factor.moments.incidence[:, 0].sum() + lidar_rows_turned(factor, at, unturned)[1].sum()
+        return slanted + of_rings[:, :, 4].sum(axis=0) @ by_rings(at)
 
     r, explained = residual(state), 0.0
     for rows, J, slope in walks:
@@ -501,7 +516,11 @@ def lidar_rows_turned(factor, at, turn):
         r = np.linalg.norm(mean)
         to_rest = np.eye(3) - np.outer(mean, mean) / r**2
         distance[e] -= too_far / r * np.append(a @ mean, to_rest @ a)
-    return np.einsum("eji,ej->ei", L, distance), np.einsum("ej,ej->e", m.incidence[:, 1:], distance[:, 1:])
+    rows, n_rings = np.einsum("eji,ej->ei", L, distance), len(factor.ring_errors)
+    wrong = ring_errors(at, name)[:n_rings] - factor.ring_errors
+    return rows + np.einsum("ekc,k->ec", m.rings[:, :, :4], wrong), np.einsum(
+        "ej,ej->e", m.incidence[:, 1:], distance[:, 1:]
+    )
 
 
 def prior_sample(unlike, setup_of, sensor, name):
@@ -869,6 +888,10 @@ SAMPLES = {
     "lidar, cauchy, pose, intrinsics": (
         "LidarFactor",
         lambda u, s, f: lidar_sample(*s, scheme="pose", loss="cauchy", imu_free=True),
+    ),
+    "lidar, errors of rings": (
+        "LidarFactor",
+        lambda u, s, f: lidar_sample(*s, beam=0.02, noisy=30.0, rings=True),
     ),
     "lidar, clock that restarts": ("LidarFactor", lambda u, s, f: lidar_sample(*s, imu_free=True, restarts=True)),
     "shared surfaces": ("PatchFactor", lambda u, s, f: patch_sample()),

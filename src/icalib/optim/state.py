@@ -225,13 +225,17 @@ def plane_value(value: np.ndarray) -> np.ndarray:
     return value if value.ndim == 1 else np.concatenate([value[:, 2], np.zeros(3)])
 
 
+NO_RINGS = np.zeros(0)
+
+
 class Planes(NamedTuple):
     """P planes in the world: unit normal (P, 3), its derivatives (P, 2, 3) by the first two parameters, and a point
-    (P, 3) on each [m]. columns (P, 3 or 5): calibration columns, -1 where fixed. The third parameter is the distance.
-    The others are offset and scale of the ranges of a LiDAR.
+    (P, 3) on each [m]. columns (P, 3 or 5 + K): calibration columns, -1 where fixed. The third parameter is the
+    distance. The others are offset and scale of the ranges of a LiDAR, and K errors of its rings.
 
     Points x of the LiDAR become (x - range_offset x / |x|) / (1 + range_scale): what is left of both errors since the
-    pass began. range_unit: derivative of both by the parameters, 1 / (1 + scale at the start).
+    pass began. range_unit: derivative of both by the parameters, 1 / (1 + scale at the start). rings (K,): what is
+    left of those of rings.
     """
 
     normal: np.ndarray
@@ -241,6 +245,7 @@ class Planes(NamedTuple):
     range_offset: float
     range_scale: float
     range_unit: float
+    rings: np.ndarray
 
     @classmethod
     def of(
@@ -249,9 +254,10 @@ class Planes(NamedTuple):
         state: State,
         columns: np.ndarray,
         ranges: tuple[float, float, float] = (0.0, 0.0, 1.0),
+        rings: np.ndarray = NO_RINGS,
     ) -> Planes:
         """Planes, or tilts of the target, with the keys `keys` and their values in `state`. A tilt turns its plane
-        about x and y of the world. ranges: offset, scale and unit."""
+        about x and y of the world. ranges: offset, scale and unit; rings (K,): their errors."""
         value = np.array([plane_value(state.values[key]) for key in keys])
         across = np.array(
             [
@@ -259,4 +265,4 @@ class Planes(NamedTuple):
                 for key, v in zip(keys, value, strict=True)
             ]
         )
-        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, *ranges)
+        return cls(value[:, :3].copy(), across, value[:, 3:].copy(), columns, *ranges, rings)

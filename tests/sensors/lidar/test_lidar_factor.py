@@ -17,6 +17,7 @@ from icalib.motion.poses import Poses, assign_keyframes, poses_at
 from icalib.optim.arrowhead import make_pieces
 from icalib.optim.state import KEYFRAME_DIM
 from icalib.sensors.lidar.binning import AssociatedPoints, LidarNoise, in_world, take_moments
+from icalib.sensors.lidar.residual import RINGS_SEEN, rings_seen, true_rings
 from icalib.tools.simulation import simulate
 
 
@@ -137,6 +138,74 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
     np.testing.assert_allclose(g / size, slope, rtol=0, atol=bound * np.linalg.norm(r))
     np.testing.assert_allclose((g / size)[o:], slope[o:], rtol=0, atol=0.1 * bound * np.linalg.norm(r))
     assert cost == pytest.approx(0.5 * r @ r, rel=bound)
+
+
+@each("beam", [0.0, 0.03])
+def test_errors_of_rings_move_their_points(sparse_room, room_of, dense, beam):
+    """Against points that are moved one by one, by 1 mrad up and down, and by 1 mm nearer and farther. The ring with
+    most points has no offset of its own."""
+    setup = room_of(sparse_room, spacing=0.05, rings=True)
+    state, noise, bin_s, h = setup.perturbed(np.random.default_rng(0), 0.1), LidarNoise(0.1, beam), 1e-4, 1e-3
+    factor = setup.factor(state, noise, bin_s=bin_s)
+    factor = replace(factor, noise_angle=np.zeros_like(factor.noise_angle))
+    _, H, g, _ = sums(setup, factor, state, dense)
+    off, o = np.array([state.values["lidar0", name] for name in RINGS]), KEYFRAME_DIM * len(state.seconds)
+    point = pointwise(corrected(setup, *off), state, bin_s)
+    ring, sigma = rings_of_points(setup)[setup.plane >= 0], np.hypot(noise.sigma, beam * point.incidence)
+    assert (np.abs(point.r) / sigma).max() < 4.0
+    slope, columns = np.zeros(len(g)), o + setup.layout.columns("lidar0", *RINGS)
+    for name, step in zip(RINGS, h * np.eye(2)[:, :, None], strict=True):
+        up, down = (pointwise(corrected(setup, *(off + sign * step)), state, bin_s) for sign in (1.0, -1.0))
+        own = o + setup.layout.columns("lidar0", name)
+        point.J[:, own] = (ring[:, None] == np.arange(16)) * ((up.r - down.r) / (2.0 * h))[:, None]
+        cost = [0.5 * (x.r / np.hypot(noise.sigma, beam * x.incidence)) ** 2 for x in (up, down)]
+        slope[own] = np.bincount(ring, cost[0] - cost[1], minlength=16) / (2.0 * h)
+    J = point.J / sigma[:, None]
+    size = np.sqrt(np.maximum((J**2).sum(axis=0), 1e-6 * (J**2).sum(axis=0).max()))
+    reference = columns[16 + np.bincount(rings_of_points(setup)).argmax()]
+    assert not H[reference].any() and g[reference] == 0.0
+    J[:, reference] = slope[reference] = 0.0
+    np.testing.assert_allclose(
+        (H / np.outer(size, size))[columns], (J.T @ J / np.outer(size, size))[columns], rtol=0, atol=2e-3
+    )
+    found, expected = g[columns] / size[columns], slope[columns] / size[columns]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 * np.sqrt(len(ring)))
+
+
+RINGS = "ring_elevations", "ring_offsets"
+
+
+def test_corrected_rings_are_moved_one_by_one(sparse_room, room_of):
+    """Of a part of the points, too, which does not have all rings."""
+    setup = room_of(sparse_room)
+    off = np.random.default_rng(1).normal(size=(2, 16)) * 0.01
+    values = {("lidar0", RINGS_SEEN): rings_seen(setup.stream)} | {
+        ("lidar0", x): v for x, v in zip(RINGS, off, strict=True)
+    }
+    state, expected = replace(setup.state, values=setup.state.values | values), corrected(setup, *off).stream
+    np.testing.assert_allclose(true_rings(setup.stream, state).xyz, expected.xyz, rtol=0, atol=2e-6)
+    high = np.flatnonzero(setup.stream.xyz[:, 2] > 0.0)
+    np.testing.assert_allclose(
+        true_rings(setup.stream.numbered(high), state).xyz, expected.xyz[high], rtol=0, atol=2e-6
+    )
+
+
+def rings_of_points(setup):
+    """(N,) band of each point, of 16: 8 rings are in the nearest one."""
+    x, y, z = setup.stream.xyz.astype(np.float64).T
+    _, ring = np.unique(np.round(np.rad2deg(np.arctan2(z, np.hypot(x, y)))), return_inverse=True)
+    return np.array([0, 2, 4, 6, 9, 11, 13, 15])[ring]
+
+
+def corrected(setup, turn, too_far):
+    """The setup with points turned by `turn` (16,) and nearer by `too_far` (16,), the errors of their rings."""
+    x, y, z = setup.stream.xyz.astype(np.float64).T
+    ring = rings_of_points(setup)
+    level, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)) + turn[ring]
+    r = np.linalg.norm([x, y, z], axis=0) - too_far[ring]
+    xyz = r * np.array([np.cos(elevation) * np.cos(level), np.cos(elevation) * np.sin(level), np.sin(elevation)])
+    stream = replace(setup.stream, xyz=xyz.T.astype(np.float32))
+    return replace(setup, sim=replace(setup.sim, measurements=setup.sim.measurements.with_streams(stream)))
 
 
 def brisk(robot_scenario):

@@ -20,7 +20,7 @@ so the inner loop works on their coordinates alone and is vectorised.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -32,6 +32,7 @@ from icalib.motion.poses import EstimatedMotion, instants, sweep, usable
 from icalib.optim.arrowhead import in_parallel
 from icalib.optim.rows import LOSSES, weight
 from icalib.rig import Loss
+from icalib.sensors.lidar.spec import N_RINGS, OF_RINGS
 
 BIN_S = 3e-3  # duration of a bin; its points share the pose perturbation of its centre
 COARSE_BIN_S = 11e-3  # duration of a bin in early passes: fewer bins while the state is still inaccurate
@@ -61,14 +62,19 @@ class LidarNoise:
         return float(np.hypot(self.sigma, self.beam_sigma))
 
 
+NO_RINGS = np.zeros(0, np.uint8)
+
+
 @dataclass(frozen=True)
 class AssociatedPoints:
     """Points of one LiDAR and their planes. plane (N,) int32: row of `planes` for each point, -1: none. planes (P, 6):
-    normal, and a point [m], in the world frame."""
+    normal, and a point [m], in the world frame. ring (N,) uint8: ring of each point, of K, if errors of rings matter.
+    """
 
     stream: LidarStream
     plane: np.ndarray
     planes: np.ndarray
+    ring: np.ndarray = field(default_factory=lambda: NO_RINGS)
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,9 @@ class Moments:
     seconds (n,): centres of the bins on the LiDAR's clock, since its first stamp; plane, count (E,): plane and number
     of points of each entry. root (E, 10): lower Cholesky factor L, row by row, of the moments sum w (1, x) (1, x)^T; w
     is the robust weight of a point over its variance. incidence (E, 4): incidence term, the change of half the chi^2
-    with the variances, incidence . (1, R_world_lidar^T n).
+    with the variances, incidence . (1, R_world_lidar^T n). rings (E, 2 K, 7) float32, K = 0 without rings: for points
+    of each ring that move by s_e off the plane per rad of elevation, and by s_o per m of offset, L^-1 sum w s (1, x),
+    the change of half the chi^2 with the variances, sum w s s_e, and sum w s s_o: s is s_e first, then s_o.
     """
 
     seconds: np.ndarray
@@ -88,6 +96,7 @@ class Moments:
     count: np.ndarray
     root: np.ndarray
     incidence: np.ndarray
+    rings: np.ndarray
 
 
 def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarNoise, bin_s: float = BIN_S) -> Moments:
@@ -100,7 +109,7 @@ def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarN
     seconds, bins, *entries = zip(
         *in_parallel(lambda group: _moments_of(cloud, motion, noise, bin_s, group), groups), strict=True
     )
-    at, (plane, count, root, incidence) = np.concatenate(seconds), (np.concatenate(e) for e in entries)
+    at, (plane, count, root, incidence, rings) = np.concatenate(seconds), (np.concatenate(e) for e in entries)
     if not len(root):
         raise EstimationError(
             f"{cloud.stream.name}: no point lies on a plane while {motion.imu.name} was running; check that the clocks "
@@ -112,7 +121,7 @@ def take_moments(cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarN
     bin_of = bin_of[order]
     first = np.flatnonzero(np.diff(bin_of, prepend=-1))
     start = np.append(first, len(bin_of))
-    return Moments(at[bin_of[first]], start, plane[order], count[order], root[order], incidence[order])
+    return Moments(at[bin_of[first]], start, *(e[order] for e in (plane, count, root, incidence, rings)))
 
 
 def _scan_groups(stream: LidarStream) -> Iterator[slice]:
@@ -123,10 +132,10 @@ def _scan_groups(stream: LidarStream) -> Iterator[slice]:
 
 
 def _scans_with_steps(
-    stream: LidarStream, plane: np.ndarray, step_s: float, per_bin: int, group: slice
+    stream: LidarStream, plane: np.ndarray, step_s: float, per_bin: int, group: slice, ring: np.ndarray = NO_RINGS
 ) -> tuple[Scans, np.ndarray, slice]:
     """A group of scans divided into steps of step_s, per_bin of which make a bin; the middles of the steps (n,) on the
-    LiDAR's clock [s]; and the slice of the points. plane (N,): plane of each point of the stream."""
+    LiDAR's clock [s]; and the slice of the points. plane (N,), ring (N,): of each point of the stream."""
     start = stream.start[group.start : group.stop + 1]
     points = slice(int(start[0]), int(start[-1]))
     start, offset_s = start - start[0], stream.offset_s[points]
@@ -135,22 +144,24 @@ def _scans_with_steps(
     step_start = np.concatenate([[0], np.cumsum(count)])
     number = np.arange(step_start[-1]) - np.repeat(step_start[:-1] - first, count)
     seconds = np.repeat(stream.seconds[group], count) + (number + 0.5) * step_s
-    return Scans(start, offset_s, stream.xyz[points], plane[points], first, step_start), seconds, points
+    scans = Scans(start, offset_s, stream.xyz[points], plane[points], ring[points], first, step_start)
+    return scans, seconds, points
 
 
 def _moments_of(
     cloud: AssociatedPoints, motion: EstimatedMotion, noise: LidarNoise, bin_s: float, group: slice
 ) -> tuple[np.ndarray, ...]:
-    """Centres [s] of the bins of a group of scans; and bin, plane, count, root and incidence of each entry."""
+    """Centres [s] of the bins of a group of scans; and bin, plane, count, root, incidence and rings of each entry."""
     per_bin = steps_of(bin_s)
-    scans, seconds, _ = _scans_with_steps(cloud.stream, cloud.plane, bin_s / per_bin, per_bin, group)
+    scans, seconds, _ = _scans_with_steps(cloud.stream, cloud.plane, bin_s / per_bin, per_bin, group, cloud.ring)
     times = instants(cloud.stream, motion.state.values, seconds)
     # All steps of a bin are propagated from one keyframe: trajectories of two keyframes may differ before convergence.
     lidar = sweep(motion, cloud.stream.name, times, np.repeat(times[per_bin // 2 :: per_bin], per_bin))
     poses = _bin_poses(len(times), len(times) // per_bin)
     fill_bin_poses(lidar, per_bin, usable(motion.imu, times, motion.max_gap_s), poses)
     weights = RangeWeights(noise.sigma**2, noise.beam_sigma**2, LOSSES[noise.loss], noise.loss_scale)
-    entries = _empty_entries(min(len(scans.xyz), len(poses.p_world_bin) * len(cloud.planes)))
+    size, n_errors = min(len(scans.xyz), len(poses.p_world_bin) * len(cloud.planes)), N_ERRORS * (len(cloud.ring) > 0)
+    entries = (*_empty_entries(size), np.empty((size, n_errors, RING_SUMS), np.float32))
     k = bin_scans(scans, lidar, poses, per_bin, cloud.planes, weights, per_bin / bin_s, entries)
     return seconds[per_bin // 2 :: per_bin], *(e[:k].copy() for e in entries)
 
@@ -211,6 +222,8 @@ def points_on_planes(motion: EstimatedMotion, stream: LidarStream, plane: np.nda
 
 N_MOMENTS = 10  # products of (1, x, y, z), lower triangle row by row
 N_SUMS = N_MOMENTS + 3  # the moments, then the gradient of the incidence term
+N_ERRORS = len(OF_RINGS) * N_RINGS  # errors of rings, 2 K
+RING_SUMS = 5 + len(OF_RINGS)  # numbers of each of them in an entry, see `Moments.rings`
 MAX_INCIDENCE_CHI2 = 16.0  # 4 sigma; larger values do not enter the incidence term: outliers, or an inaccurate state
 MIN_PIVOT = 1e-13  # relative to the diagonal moment; a smaller pivot is a rounding error of float64
 
@@ -219,14 +232,16 @@ class Scans(NamedTuple):
     """S scans of N points, and the time steps into which the points fall.
 
     start (S + 1,): points of scan i are start[i]:start[i + 1]; offset_s (N,): time since the stamp of the scan; xyz
-    (N, 3) [m]; plane (N,): plane of each point, -1: none. first_step (S,): number of the first step of a scan, counted
-    from its stamp. step_start (S + 1,): position of this step among all steps. Both are multiples of the steps per bin.
+    (N, 3) [m]; plane (N,): plane of each point, -1: none; ring (N,): its ring; empty where these do not matter.
+    first_step (S,): number of the first step of a scan, counted from its stamp. step_start (S + 1,): position of this
+    step among all steps. Both are multiples of the steps per bin.
     """
 
     start: np.ndarray
     offset_s: np.ndarray
     xyz: np.ndarray
     plane: np.ndarray
+    ring: np.ndarray
     first_step: np.ndarray
     step_start: np.ndarray
 
@@ -302,8 +317,8 @@ def _fill_distance_at(R, p, plane, m):
 def _sort_scan(i, scans, per_s, n_planes, ends, points):
     """Sorts the points of scan i by step and plane (counting sort).
 
-    Fills points (4, n): x, y, z [m], and time since the middle of the step [s]; and ends: the group of a step and plane
-    ends before ends[step * n_planes + plane], where the next group begins.
+    Fills points (4 or 5, n): x, y, z [m], time since the middle of the step [s], and the ring, if any; and ends: the
+    group of a step and plane ends before ends[step * n_planes + plane], where the next group begins.
     """
     first_step, step_s = scans.first_step[i], 1.0 / per_s
     # Unsigned indices spare the test whether an index counts from the end.
@@ -324,6 +339,8 @@ def _sort_scan(i, scans, per_s, n_planes, ends, points):
             to = np.uint64(ends[key])
             points[0, to], points[1, to], points[2, to] = scans.xyz[n, 0], scans.xyz[n, 1], scans.xyz[n, 2]
             points[3, to] = offset - (k + 0.5) * step_s
+            if len(scans.ring):
+                points[4, to] = scans.ring[n]
             ends[key] += 1
 
 
@@ -338,6 +355,19 @@ def _moved_by_twist(x, y, z, dt, rate, velocity):
         y + dt * (v1 + w2 * mx - w0 * mz),
         z + dt * (v2 + w0 * my - w1 * mx),
     )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _weighed(x, y, z, m, weights):
+    """Weight of point (x, y, z) with the distance m (4,) from a plane; and its g, such that half its chi^2 changes with
+    its variance by -g (x, y, z) times the change of m[1:]."""
+    across = m[1] * x + m[2] * y + m[3] * z
+    distance, square = m[0] + across, x * x + y * y + z * z
+    over = 1.0 / (weights.variance * square + weights.beam_variance * across * across)
+    w = square * over
+    chi2 = distance * distance * w
+    robust = weight(weights.loss, weights.scale, chi2)[0]
+    return w * robust, robust * chi2 * weights.beam_variance * across * over if chi2 < MAX_INCIDENCE_CHI2 else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
@@ -360,21 +390,42 @@ def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
         a, b, c = _moved_by_twist(x, y, z, dt, rate, velocity)
         x, y = R00 * a + R01 * b + R02 * c + p0, R10 * a + R11 * b + R12 * c + p1
         z = R20 * a + R21 * b + R22 * c + p2
-        across = n0 * x + n1 * y + n2 * z
-        distance, square = m0 + across, x * x + y * y + z * z
-        over = 1.0 / (weights.variance * square + weights.beam_variance * across * across)
-        w = square * over
-        chi2 = distance * distance * w
-        robust = weight(weights.loss, weights.scale, chi2)[0]
-        g = robust * chi2 * weights.beam_variance * across * over if chi2 < MAX_INCIDENCE_CHI2 else 0.0
+        w, g = _weighed(x, y, z, (m0, n0, n1, n2), weights)
         g0, g1, g2 = g0 - g * x, g1 - g * y, g2 - g * z
-        w *= robust
         wx, wy, wz = w * x, w * y, w * z
         s0, s1, s2, s3, s4 = s0 + w, s1 + wx, s2 + wx * x, s3 + wy, s4 + wy * x
         s5, s6, s7, s8, s9 = s5 + wy * y, s6 + wz, s7 + wz * x, s8 + wz * y, s9 + wz * z
     added = (s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, g0, g1, g2)
     for k in range(N_SUMS):
         sums[k] += added[k]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _add_rings(points, begin, end, R, p, rate, velocity, m, weights, rings):
+    """Adds the points of `_add_points` to rings (2 K, 7), see `Moments`, not yet times L^-1. A higher beam moves its
+    point by |x| per rad, across the beam, and an offset along it. Turns within the step are neglected there."""
+    rate, velocity = (rate[0], rate[1], rate[2]), (velocity[0], velocity[1], velocity[2])
+    for n in range(begin, end):
+        x, y, z, dt = (np.float64(points[0, n]), np.float64(points[1, n]), np.float64(points[2, n]), points[3, n])
+        level = np.sqrt(x * x + y * y)
+        level_part, up_part = 0.0, 0.0
+        for i in range(3):
+            level_part += m[1 + i] * (R[i, 0] * x + R[i, 1] * y) / level
+            up_part += m[1 + i] * R[i, 2]
+        moves = (up_part * level - level_part * z, -(level_part * level + up_part * z) / np.sqrt(level**2 + z**2))
+        a, b, c = _moved_by_twist(x, y, z, np.float64(dt), rate, velocity)
+        x, y = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0], R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
+        z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
+        w, g = _weighed(x, y, z, m, weights)
+        for f in range(2):
+            of_ring, s = rings[f * N_RINGS + int(points[4, n])], moves[f]
+            of_ring[0] += w * s
+            of_ring[1] += w * s * x
+            of_ring[2] += w * s * y
+            of_ring[3] += w * s * z
+            of_ring[4] -= g * s if f == 0 else 0.0  # an offset leaves incidences as they are
+            of_ring[5] += w * s * moves[0]
+            of_ring[6] += w * s * moves[1]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -395,9 +446,9 @@ def _factorise(M):
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _write_entry(c, q, number, m, sums, entries, total):
-    """Writes the entry of plane q in bin c at `total`: `number` points with the sums (13,)."""
-    bins, plane, count, root, incidence = entries
+def _write_entry(c, q, number, m, sums, ring_sums, entries, total):
+    """Writes the entry of plane q in bin c at `total`: `number` points with the sums (13,), and (2 K, 7) of rings."""
+    bins, plane, count, root, incidence, rings = entries
     bins[total], plane[total], count[total] = c, q, number
     for k in range(N_MOMENTS):
         root[total, k] = sums[k]
@@ -405,6 +456,14 @@ def _write_entry(c, q, number, m, sums, entries, total):
     for k in range(3):
         incidence[total, 1 + k] = sums[N_MOMENTS + k]
     incidence[total, 0] = -(sums[10] * m[1] + sums[11] * m[2] + sums[12] * m[3])
+    for k in range(rings.shape[1]):
+        for i in range(4):
+            for j in range(i):
+                ring_sums[k, i] -= root[total, i * (i + 1) // 2 + j] * ring_sums[k, j]
+            pivot = root[total, i * (i + 1) // 2 + i]
+            ring_sums[k, i] = ring_sums[k, i] / pivot if pivot > 0.0 else 0.0
+        for i in range(RING_SUMS):
+            rings[total, k, i] = ring_sums[k, i]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -412,6 +471,7 @@ def _bin_scan(i, scans, motion, poses, per_bin, planes, weights, sorted_points, 
     """Writes the entries of scan i from `total` on, in the order of bins and planes. Returns the new total."""
     ends, points = sorted_points
     first, m, sums = scans.step_start[i], np.empty(4), np.empty(N_SUMS)
+    ring_sums = np.empty((entries[5].shape[1], RING_SUMS))
     for c in range(first // per_bin, scans.step_start[i + 1] // per_bin):
         for q in range(len(planes)):
             number = 0
@@ -424,11 +484,14 @@ def _bin_scan(i, scans, motion, poses, per_bin, planes, weights, sorted_points, 
                     _fill_distance_at(poses.R_world_bin[c], poses.p_world_bin[c], planes[q], m)
                     for k in range(N_SUMS):
                         sums[k] = 0.0
+                    ring_sums[:] = 0.0
                 R, p, rate, velocity = poses.R_bin_step[b], poses.p_bin_step[b], motion.rate[b], motion.velocity[b]
                 _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums)
+                if len(ring_sums):
+                    _add_rings(points, begin, end, R, p, rate, velocity, m, weights, ring_sums)
                 number += end - begin
             if number:
-                _write_entry(c, q, number, m, sums, entries, total)
+                _write_entry(c, q, number, m, sums, ring_sums, entries, total)
                 total += 1
     return total
 
@@ -438,13 +501,13 @@ def bin_scans(scans, motion, poses, per_bin, planes, weights, per_s, entries):
     """Sums the points of all scans in bins of per_bin steps. Returns the number of entries.
 
     motion: `Sweep` at the steps; planes (P, 6): normal, point; per_s: steps per second. Fills `entries`: bin, plane,
-    count, root and incidence of each entry, see `Moments`.
+    count, root, incidence and rings of each entry, see `Moments`.
     """
     n_keys, n_points, total = 0, 0, 0
     for i in range(len(scans.start) - 1):
         n_keys = max(n_keys, (scans.step_start[i + 1] - scans.step_start[i]) * len(planes))
         n_points = max(n_points, scans.start[i + 1] - scans.start[i])
-    ends, points = np.empty(n_keys, np.int64), np.empty((4, n_points), np.float32)
+    ends, points = np.empty(n_keys, np.int64), np.empty((5 if len(scans.ring) else 4, n_points), np.float32)
     for i in range(len(scans.start) - 1):
         scan_ends = ends[: (scans.step_start[i + 1] - scans.step_start[i]) * len(planes)]
         _sort_scan(i, scans, per_s, len(planes), scan_ends, points)

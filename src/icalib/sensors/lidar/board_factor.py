@@ -44,7 +44,7 @@ from icalib.optim.rows import Rows
 from icalib.optim.state import Key, Layout, State, in_recording
 from icalib.rig.scene import SHEET_MIDDLE, TILT
 from icalib.sensors.lidar.binning import LidarNoise, each_in_world
-from icalib.sensors.lidar.residual import range_errors, true_ranges
+from icalib.sensors.lidar.residual import elevations, range_errors, true_ranges
 from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
 
 # Points nearer to the rim of the sheet are not used: their beams (some 3 mrad wide, 1 cm at 3 m) miss it in part.
@@ -188,11 +188,6 @@ def _measured(stream: LidarStream, scan: int) -> np.ndarray:
     """`_Cloud.measured` (n, 4) of a scan."""
     points = slice(stream.start[scan], stream.start[scan + 1])
     return np.column_stack([stream.xyz[points], stream.offset_s[points]]).astype(np.float64)
-
-
-def elevations(xyz: np.ndarray) -> np.ndarray:
-    """(n,) elevations of points xyz (n, 3) above the LiDAR's x-y plane [rad]."""
-    return np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
 
 
 def in_scene(xyz: np.ndarray, lidar: str, keyframe: np.ndarray, state: State) -> np.ndarray:

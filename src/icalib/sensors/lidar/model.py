@@ -17,8 +17,8 @@ from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.binning import BIN_S, COARSE_BIN_S, LidarNoise, points_on_planes
 from icalib.sensors.lidar.board_factor import ON_EDGES, BoardFactor
 from icalib.sensors.lidar.patch_factor import PatchFactor
-from icalib.sensors.lidar.residual import LidarFactor
-from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
+from icalib.sensors.lidar.residual import LidarFactor, true_rings
+from icalib.sensors.lidar.spec import OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 
 # Isotropic noise in addition to stated range noise; without it beams parallel to a plane would have infinite weight.
 GRAZING_SIGMA_M = 1e-3
@@ -32,9 +32,9 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
 
     def is_estimated(self, sensor: Lidar, spec: ParameterSpec, rig: Rig, association: PlaneAssociation) -> bool:
         """See `SensorModel`. Surfaces that LiDARs at rest share show neither offset nor scale of ranges. The offset is
-        always estimated on sheets, whose distance is known from images."""
+        always estimated on sheets, whose distance is known from images. Rings are estimated in motion only."""
         on_sheets = association.at_rest and rig.has_target
-        if spec in (RANGE_OFFSET, RANGE_SCALE) and association.at_rest and not on_sheets:
+        if association.at_rest and spec in (OF_RINGS if on_sheets else (RANGE_OFFSET, RANGE_SCALE, *OF_RINGS)):
             return False
         if spec is RANGE_OFFSET and sensor.range_offset.value is None:
             k = [x.name for x in rig.lidars].index(sensor.name)
@@ -90,14 +90,14 @@ class LidarModel(SensorModel[Lidar, LidarNoise]):
         """One factor for all points on planes, at rest for those on the target. Coarse passes use fewer points and
         longer bins."""
         if at.motion is None:
-            yield from BoardFactor.build(stream, noise, at) if at.rig.has_target else ()
+            yield from BoardFactor.build(true_rings(stream, at.state), noise, at) if at.rig.has_target else ()
             return
         plane = _plane(sensor, at)
         used, bin_s = (thinned(plane), COARSE_BIN_S) if at.coarse else (plane, BIN_S)
         scheme = at.rig.settings.scheme
         yield LidarFactor.build(stream, used, at.association.surfaces, at.motion, noise, at.layout, scheme, bin_s)
         if at.association.sheets and not at.coarse:
-            yield from BoardFactor.build(stream, noise, at)
+            yield from BoardFactor.build(true_rings(stream, at.state), noise, at)
 
     def joint_factors(
         self, sensors: Sequence[Lidar], factors: Sequence[Factor], noise: Mapping[str, LidarNoise], at: Pass

@@ -45,7 +45,7 @@ from icalib.optim.arrowhead import Piece
 from icalib.optim.rows import KEYFRAME_PAIR_DIM, Rows
 from icalib.optim.state import Layout, State
 from icalib.sensors.lidar.binning import LidarNoise
-from icalib.sensors.lidar.residual import true_ranges
+from icalib.sensors.lidar.residual import true_points
 
 ON_PATCHES = "points on shared surfaces"  # kind of residuals
 GATE_SIGMAS = 4.0  # largest distance of a used point from its patch, in standard deviations of the noise
@@ -229,7 +229,7 @@ class PatchFactor(RowFactor):
     @classmethod
     def build(cls, noise: LidarNoise, at: Pass) -> PatchFactor:
         """The factor of all LiDARs in a pass."""
-        streams = {s.name: true_ranges(s, at.state) for s in at.measurements.lidars}
+        streams = {s.name: true_points(s, at.state) for s in at.measurements.lidars}
         sigma = float(np.hypot(noise.sigma, noise.beam_sigma))
         points = PatchPoints.of(streams, at.state, sigma, GATE_SIGMAS * sigma)
         rows = PatchRows.of(points, tuple(streams), at.state, sigma, noise.flatness)

@@ -2,7 +2,8 @@
 
     residual = n . (p_world_lidar(t) + R_world_lidar(t) x) - d    for each point x at its instant t
 
-Here x is the measured point less range_offset along its beam, over 1 + range_scale. The factor has 1 + range_scale
+Here x is the measured point, turned by the ring_elevation of its ring, less its ring_offset and range_offset along its
+beam, over 1 + range_scale. The factor has 1 + range_scale
 times this distance, over the value at the start of a pass: its noise does not depend on the scale.
 
 This is the signed form of (24) and (25). A factor stores moments of the points (`take_moments`), computed once per
@@ -29,9 +30,9 @@ from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.state import Key, Layout, Planes, State, plane_value
 from icalib.rig import Scheme
 from icalib.sensors.lidar import kernels
-from icalib.sensors.lidar.binning import BIN_S, AssociatedPoints, LidarNoise, Moments, take_moments
+from icalib.sensors.lidar.binning import BIN_S, NO_RINGS, AssociatedPoints, LidarNoise, Moments, take_moments
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
-from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
+from icalib.sensors.lidar.spec import N_RINGS, OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 
 BINS_PER_CHUNK = 512  # poses and Jacobians of so many bins fit the processor cache
 
@@ -52,14 +53,65 @@ def true_ranges(stream: LidarStream, state: State) -> LidarStream:
     return replace(stream, xyz=stream.xyz * ((1.0 - offset / distance) / (1.0 + scale)))
 
 
+RINGS_SEEN = "rings seen"  # key of a state: elevations of the lowest and highest ring [rad], band with most points
+FEW_POINTS, ENOUGH_POINTS = 1e-5, 500_000  # share of points that may be beyond them; points by which they are found
+
+
+def elevations(xyz: np.ndarray) -> np.ndarray:
+    """(n,) elevations of points xyz (n, 3) above the LiDAR's x-y plane [rad]."""
+    return np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+
+
+def rings_seen(stream: LidarStream, state: State | None = None) -> np.ndarray:
+    """The value of RINGS_SEEN: that of the state, which holds for parts of the stream, too, or that of the stream."""
+    if state is not None and (stream.name, RINGS_SEEN) in state.values:
+        return state.values[stream.name, RINGS_SEEN]
+    some = elevations(stream.xyz[:: len(stream.xyz) // ENOUGH_POINTS | 1])
+    ends = np.quantile(some, [FEW_POINTS, 1.0 - FEW_POINTS])
+    return np.append(ends, np.bincount(_bands(some, *ends)).argmax())
+
+
+def rings_of(stream: LidarStream, state: State) -> np.ndarray:
+    """(N,) uint8: band of elevation of each point. Bands are evenly spaced, from the middle of the first at the lowest
+    ring to the middle of the last at the highest."""
+    return _bands(elevations(stream.xyz), *rings_seen(stream, state)[:2])
+
+
+def _bands(elevation: np.ndarray, low: float, high: float) -> np.ndarray:
+    per_band = (N_RINGS - 1) / max(high - low, 1e-9)  # a LiDAR of one ring has one band
+    return np.clip(np.rint((elevation - low) * per_band), 0, N_RINGS - 1).astype(np.uint8)
+
+
+def ring_errors(state: State, lidar: str) -> np.ndarray:
+    """(2 K,) elevations [rad], then offsets [m] of rings, in the order of OF_RINGS."""
+    return np.concatenate([state.values.get((lidar, x.name), np.zeros(N_RINGS)) for x in OF_RINGS])
+
+
+def true_rings(stream: LidarStream, state: State) -> LidarStream:
+    """The stream with corrected elevations and offsets of rings."""
+    if not (off := ring_errors(state, stream.name)).any():
+        return stream
+    turn, offset = off.astype(np.float32).reshape(-1, N_RINGS)[:, rings_of(stream, state)]
+    (x, y, z), shorter = stream.xyz.T, 1.0 - offset / np.linalg.norm(stream.xyz, axis=1)
+    level, up, along = np.hypot(x, y), shorter * np.sin(turn), shorter * np.cos(turn)
+    ratio = along - up * z / level
+    return replace(stream, xyz=np.column_stack([x * ratio, y * ratio, z * along + level * up]))
+
+
+def true_points(stream: LidarStream, state: State) -> LidarStream:
+    """The stream with all corrections."""
+    return true_ranges(true_rings(stream, state), state)
+
+
 @dataclass(frozen=True)
 class LidarFactor(RowFactor):
     """All scans of one LiDAR.
 
     keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
     J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
-    in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Ranges
-    have been corrected by the range_errors of the state from which the pass starts.
+    in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Points
+    have been corrected by the range_errors and ring_errors (2 K,) of the state from which the pass starts; the latter
+    are empty if all are fixed.
     """
 
     name: str
@@ -70,6 +122,7 @@ class LidarFactor(RowFactor):
     J_incidence_noise: np.ndarray
     planes: tuple[Key, ...]
     range_errors: tuple[float, float]
+    ring_errors: np.ndarray
     imu: ImuData
     gravity: float
     scheme: Scheme
@@ -91,8 +144,14 @@ class LidarFactor(RowFactor):
         """The factor of a pass that starts from `motion`. plane (N,) int32: index of each point into `planes`, -1:
         none. Raises EstimationError if no point is left."""
         values = np.array([plane_value(motion.state.values[p]) for p in planes])
-        cloud = AssociatedPoints(true_ranges(stream, motion.state), plane, values)
+        has_rings = any(b.sensor == stream.name and b.name in (x.name for x in OF_RINGS) for b in layout.free)
+        ring = rings_of(stream, motion.state) if has_rings else NO_RINGS
+        errors = ring_errors(motion.state, stream.name) if has_rings else np.zeros(0)
+        cloud = AssociatedPoints(true_points(stream, motion.state), plane, values, ring)
         moments = take_moments(cloud, motion, noise, bin_s)
+        if has_rings:  # that with most points has no offset of its own
+            reference = int(rings_seen(stream, motion.state)[-1])
+            moments.rings[:, N_RINGS + reference] = moments.rings[:, reference, -1] = 0.0
         times = instants(stream, motion.state.values, moments.seconds)
         keyframe = assign_keyframes(scheme, motion.state.seconds, times, motion.imu.forwards)
         noise_angle = motion.imu.rotation_sigma(motion.state.seconds[keyframe], times)
@@ -103,7 +162,7 @@ class LidarFactor(RowFactor):
         n = len(motion.state.seconds)
         factor = cls(
             stream.name, moments, keyframe, noise_angle, J_rows, J_incidence, planes,
-            range_errors(motion.state, stream.name), motion.imu, motion.gravity, scheme, layout, n,
+            range_errors(motion.state, stream.name), errors, motion.imu, motion.gravity, scheme, layout, n,
         )  # fmt: skip
         factor._linearise_noise(motion.state)
         return factor
@@ -120,8 +179,9 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _plane_columns(self) -> np.ndarray:
-        """(P, 5) calibration columns of each plane, see `Planes`. The distance of the sheet of the target is known."""
-        ranges = [self.layout.block(self.name, x.name).columns for x in (RANGE_OFFSET, RANGE_SCALE)]
+        """(P, 5 + 2 K) calibration columns of each plane, see `Planes`. The distance of the target's sheet is known."""
+        errors = (RANGE_OFFSET, RANGE_SCALE, *(OF_RINGS if len(self.ring_errors) else ()))
+        ranges = [self.layout.block(self.name, x.name).columns for x in errors]
         planes = (np.append(self.layout.block(*p).columns, -1)[: kernels.PLANE_DIM] for p in self.planes)
         return np.array([np.concatenate([plane, *ranges]) for plane in planes])
 
@@ -163,11 +223,14 @@ class LidarFactor(RowFactor):
         (offset, scale), (offset0, scale0), m = range_errors(state, self.name), self.range_errors, self.moments
         per_unit = 1.0 / (1.0 + scale0)
         left = per_unit * (offset - offset0), per_unit * (scale - scale0), per_unit
-        planes = Planes.of(self.planes, state, self._plane_columns, left)
+        rings = self.ring_errors
+        rings = ring_errors(state, self.name) - rings if len(rings) else rings
+        planes = Planes.of(self.planes, state, self._plane_columns, left, rings)
         kinematics = Kinematics(self.name, self.layout, self.imu, self.gravity, self.scheme)
         for columns, a, b in self._chunk_ends(state, kinematics, b0, b1):
             keyframe, noise = self.keyframe[a:b], (self.J_rows_noise, self.J_incidence_noise)
-            bins = Bins(keyframe, self.noise_angle[a:b], m.start[a : b + 1], m.plane, m.root, m.incidence, *noise)
+            entries = m.plane, m.root, m.incidence, m.rings
+            bins = Bins(keyframe, self.noise_angle[a:b], m.start[a : b + 1], *entries, *noise)
             yield bins, SensorPose.at(kinematics, m.seconds[a:b], keyframe, state), columns, planes
 
     def _chunk_ends(

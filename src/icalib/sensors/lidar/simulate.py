@@ -14,7 +14,7 @@ from icalib.base.compiled import njit
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
-from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE, Lidar
+from icalib.sensors.lidar.spec import N_RINGS, RANGE_OFFSET, RANGE_SCALE, RING_ELEVATIONS, RING_OFFSETS, Lidar
 from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, RoomSurfaces, nearest
@@ -48,7 +48,8 @@ class SimLidar(SimSensor):
     A scan is one turn of azimuth_steps columns with `rings` points, at elevations evenly over elevation_deg. The lasers
     of a column fire 2.304 us apart, or faster if a column is shorter. The stamp of a scan is the instant of its first
     column. Points outside range_m are missing. Noise is along the beam. scale: ratio of true to reported ranges.
-    range_offset_m: reported less true ranges. elevation_errors_deg: true less reported elevation of each ring.
+    range_offset_m: reported less true ranges; ring_offsets_m: of each ring, in addition. elevation_errors_deg: true
+    less reported elevation of each ring.
     """
 
     sensor_type: ClassVar[str] = "lidar"
@@ -57,6 +58,7 @@ class SimLidar(SimSensor):
     effects: ClassVar = {
         "range_scale": ("scale", true_ratio),
         "range_offset": ("range_offset_m", lambda value: limited(value, MAX_OFFSET_M)),
+        "ring_offsets": ("ring_offsets_m", lambda value: tuple(limited(x, MAX_OFFSET_M) for x in value.items())),
         "ring_elevations": ("elevation_errors_deg", lambda value: tuple(x.number() for x in value.items())),
     }
 
@@ -68,6 +70,7 @@ class SimLidar(SimSensor):
     range_noise_m: float = 0.03
     scale: float = 1.0
     range_offset_m: float = 0.0
+    ring_offsets_m: tuple[float, ...] = (0.0,)
     elevation_errors_deg: tuple[float, ...] = (0.0,)
 
     @classmethod
@@ -86,14 +89,20 @@ class SimLidar(SimSensor):
     def check(self, room: Room | None, drive: Drive | None) -> None:
         if room is None:
             raise RigError(f"{self.name} needs a room; give the scenario one.")
-        if (n := len(self.elevation_errors_deg)) not in (1, self.rings):
-            raise RigError(f"{self.name} has {self.rings} rings, but {n} elevation errors; give one for each ring.")
+        for errors, what in ((self.elevation_errors_deg, "elevation errors"), (self.ring_offsets_m, "ring offsets")):
+            if (n := len(errors)) not in (1, self.rings):
+                raise RigError(f"{self.name} has {self.rings} rings, but {n} {what}; give one for each ring.")
 
     def true_parameters(self) -> TrueParameters:
         true = {RANGE_SCALE.name: 1.0 / self.scale - 1.0, RANGE_OFFSET.name: self.range_offset_m}
-        rings = list(map(float, self.elevation_errors_deg))
-        entries = {"ring_elevations": rings} if any(rings) else {}
-        return TrueParameters({name: np.array([value]) for name, value in true.items() if value}, entries)
+        values = {name: np.array([value]) for name, value in true.items() if value}
+        if any(self.elevation_errors_deg):
+            off_deg = np.broadcast_to(self.elevation_errors_deg, self.rings)
+            bands = np.rint(np.linspace(0.0, N_RINGS - 1.0, self.rings)).astype(int)  # the mean of several rings
+            mean_deg = np.bincount(bands, off_deg, N_RINGS) / np.maximum(np.bincount(bands, minlength=N_RINGS), 1)
+            values[RING_ELEVATIONS.name] = np.deg2rad(mean_deg)
+        entries = {RING_OFFSETS.name: list(map(float, self.ring_offsets_m))} if any(self.ring_offsets_m) else {}
+        return TrueParameters(values, entries)
 
     @property
     def points(self) -> int:
@@ -196,7 +205,7 @@ def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.n
         position + rotation @ lidar.T_imu_sensor[:3, 3],
         _beams(lidar, np.array(lidar.elevation_errors_deg)),
         firing,
-        lidar.range_offset_m + noise,
+        lidar.range_offset_m + np.array(lidar.ring_offsets_m) + noise,
         lidar.range_m,
         lidar.scale,
         _beams(lidar),

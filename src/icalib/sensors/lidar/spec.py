@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
 from icalib.base.yaml_nodes import YamlValue
@@ -48,6 +48,33 @@ RANGE_SCALE = ParameterSpec(
     meaning="measured over true range, less 1",
     motion="move farther, where other sensors show how far",
 )
+N_RINGS = 16  # bands of elevation: each ring of a LiDAR with so many, or several rings
+# True less reported. The prior is half the width of a beam of 3 mrad, by which rings are aimed.
+RING_ELEVATIONS = ParameterSpec(
+    name="ring_elevations",
+    size=N_RINGS,
+    manifold="nuisance",
+    unit="rad",
+    labels=tuple(str(k + 1) for k in range(N_RINGS)),
+    tolerance=1e-3,
+    prior_sigma=1.5e-3,
+    one="ring_elevation",
+    is_auxiliary=True,
+    is_effect=True,
+    meaning="true less reported elevations of 16 bands of rings, the lowest first",
+    motion="show walls and floor at all elevations",
+)
+# Measured less true range, beyond range_offset, which is that of the ring with most points.
+RING_OFFSETS = replace(
+    RING_ELEVATIONS,
+    name="ring_offsets",
+    one="ring_offset",
+    unit="m",
+    tolerance=RANGE_OFFSET.tolerance,
+    prior_sigma=RANGE_OFFSET.prior_sigma,
+    meaning="range offsets of 16 bands of rings against that with most points, the lowest first",
+)
+OF_RINGS = (RING_ELEVATIONS, RING_OFFSETS)
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
@@ -67,7 +94,9 @@ class Lidar(MountedSensor):
     readings: ClassVar[str] = "scans"
     gives_motion: ClassVar[bool] = True
     shows_planes: ClassVar[bool] = True
-    parameters: ClassVar[tuple[ParameterSpec, ...]] = (*MOUNTED, CLOCK_RATE, RANGE_OFFSET, RANGE_SCALE)
+    parameters: ClassVar[tuple[ParameterSpec, ...]] = (
+        *MOUNTED, CLOCK_RATE, RANGE_OFFSET, RANGE_SCALE, *OF_RINGS,
+    )  # fmt: skip
 
     path: str
     range_noise_m: float | None = None  # sigma along the beam; None: estimated from the residuals
@@ -79,6 +108,8 @@ class Lidar(MountedSensor):
     point_time_unit: TimeUnit | None = None
     range_offset: Parameter = Parameter("fixed")
     range_scale: Parameter = Parameter("fixed")
+    ring_elevations: Parameter = Parameter("fixed")
+    ring_offsets: Parameter = Parameter("fixed")
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Lidar:

@@ -28,8 +28,8 @@ from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.assess.boards import on_boards, ranges_offset, sheet_notes, sheet_planes, wrong_sheets
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.patch_factor import PatchFactor
-from icalib.sensors.lidar.residual import LidarFactor, true_ranges
-from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
+from icalib.sensors.lidar.residual import LidarFactor, true_points
+from icalib.sensors.lidar.spec import OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 from icalib.sensors.lidar.stream import LidarResiduals
 
 MAX_KEPT_POINTS = 200_000  # of all LiDARs together that a result saves: some 10 MB
@@ -52,9 +52,9 @@ def assess(a: AssessedEstimate) -> Assessment:
     return Assessment(
         planes=planes(a.inputs, a.estimate.outcome.state),
         residuals=residuals(a.inputs, a.estimate, a.timeline),
-        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), range_notes(a)),
+        notes=chain(notes(a.inputs, a.estimate, a.timeline), sheet_notes(a), range_notes(a), ring_notes(a)),
         warnings=chain(warnings(a.inputs, a.estimate), wrong_sheets(a)),
-        causes=range_causes(a),
+        causes=chain(range_causes(a), ring_causes(a)),
     )
 
 
@@ -94,6 +94,35 @@ def range_notes(a: AssessedEstimate) -> Iterator[Remark]:
                 f"ranges of {g.sensor} are {_off(RANGE_SCALE, float(g.value[0]), float(g.std[0]))} than true ones, "
                 f"which the estimate includes; divide them by {1.0 + g.value[0]:.5g} where you use them, too.",
             )
+
+
+def ring_causes(a: AssessedEstimate) -> Iterator[Cause]:
+    """A cause for each LiDAR whose rings have other elevations or offsets than it reports."""
+    for e in a.effects:
+        if e.spec in OF_RINGS and e.differs:
+            off, advice = _rings_off(e.sensor, e.spec, e.value, e.std), f"Write {e.spec.name}: free for {e.sensor}."
+            sentence = f"{off}, as its points lie off their planes ring by ring. {advice}"
+            yield Cause(Remark("ring_errors_left_out", sentence), e.gain, e.moves > 1.0, remedy=Remedy(e.amended))
+
+
+def ring_notes(a: AssessedEstimate) -> Iterator[Remark]:
+    """Notes on each LiDAR whose rings have elevations or offsets of their own in the result."""
+    specs = {spec.name: spec for spec in OF_RINGS}
+    for g in a.groups:
+        if g.name in specs and g.columns is not None and (abs(g.value) > EFFECT_SIGMAS * g.std).any():
+            yield Remark(
+                "ring_errors_estimated",
+                f"{_rings_off(g.sensor, specs[g.name], g.value, g.std)}, which the estimate includes; correct points "
+                f"by {g.name} of the result where you use them, too.",
+            )
+
+
+def _rings_off(lidar: str, spec: ParameterSpec, value: np.ndarray, std: np.ndarray) -> str:
+    """How much numbers (K,) of rings with standard deviations (K,) are off."""
+    rms, (unit, times) = np.sqrt(np.mean(value**2)), spec.display_unit
+    largest, error = np.abs(value).max(), np.linalg.norm(value * std) / (len(value) * rms)
+    sizes = f"{times * largest:.2g} {unit} (RMS {times * rms:.2g} +- {times * error:.1g} {unit})"
+    return f"{spec.name.replace('_', ' ')} of {lidar} are off by up to {sizes}"
 
 
 def planes(inputs: Inputs, state: State) -> Iterator[Plane]:
@@ -150,7 +179,7 @@ def _thinned(inputs: Inputs, index: int, state: State) -> tuple[LidarStream, np.
     points = points[:: max(1, -(-len(points) * len(inputs.rig.lidars) // MAX_KEPT_POINTS))]
     one = stream.numbered(points)
     running = usable(inputs.imu, _seconds_of(one, state), inputs.rig.settings.max_gap_s)
-    return true_ranges(one.numbered(np.flatnonzero(running)), state), plane[points[running]]
+    return true_points(one.numbered(np.flatnonzero(running)), state), plane[points[running]]
 
 
 def _fitted_planes(clouds: list[tuple[np.ndarray, np.ndarray]], values: np.ndarray) -> np.ndarray:

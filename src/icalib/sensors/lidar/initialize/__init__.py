@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -31,7 +32,8 @@ from icalib.sensors.lidar.initialize.extrinsics import scan_poses
 from icalib.sensors.lidar.initialize.self_returns import without_self_returns
 from icalib.sensors.lidar.initialize.surroundings import are_stops, at_stops, guess_by_surroundings, stops
 from icalib.sensors.lidar.initialize.voxel_map import degeneracy_error, leading
-from icalib.sensors.lidar.spec import RANGE_OFFSET, RANGE_SCALE
+from icalib.sensors.lidar.residual import RINGS_SEEN, rings_seen
+from icalib.sensors.lidar.spec import OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 
 
 class LidarInitializer(Initializer[Lidar]):
@@ -82,9 +84,11 @@ class LidarInitializer(Initializer[Lidar]):
         """Inputs and state with points associated with planes, and known values. The rounds may change parameters that
         the motion does not determine, so the inputs keep the initial guess from before the rounds."""
         known = {key: value for lidar in inputs.rig.lidars for key, value in stated_values(inputs, lidar).items()}
-        stated = {(x.name, s.name): getattr(x, s.name) for x in inputs.rig.lidars for s in (RANGE_OFFSET, RANGE_SCALE)}
-        ranges = {key: np.zeros(1) if p.value is None else p.value for key, p in stated.items()}
-        state = replace(state, values=ranges | state.values)
+        errors: Values = {(s.name, RINGS_SEEN): rings_seen(s) for s in inputs.measurements.lidars}
+        for lidar, spec in product(inputs.rig.lidars, (RANGE_OFFSET, RANGE_SCALE, *OF_RINGS)):
+            value = getattr(lidar, spec.name).value
+            errors[lidar.name, spec.name] = np.zeros(spec.size) if value is None else value
+        state = replace(state, values=errors | state.values)
         guess = replace(state, values=state.values | known)
         inputs, state = with_lidars(inputs, state)
         return replace(inputs, guess=guess), state, known

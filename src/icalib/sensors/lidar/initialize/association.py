@@ -57,7 +57,7 @@ from icalib.sensors.lidar.board_factor import ON_SHEET, TargetSheet
 from icalib.sensors.lidar.initialize.extrinsics import lidar_and_motion, lidar_on_motion
 from icalib.sensors.lidar.initialize.voxel_map import explaining_degeneracy
 from icalib.sensors.lidar.model import FIRST_RANGE_SIGMA_M
-from icalib.sensors.lidar.residual import true_ranges
+from icalib.sensors.lidar.residual import true_points
 from icalib.sensors.lidar.spec import Lidar
 from icalib.sensors.sensor import MOUNTED_NAMES
 
@@ -317,7 +317,7 @@ def fitted_planes(inputs: Inputs, state: State, association: PlaneAssociation) -
     motion, sums = motion_of(inputs, state), np.zeros((association.count, 4, 4))
     for recorded, plane in zip(inputs.measurements.lidars, association.plane, strict=True):
         if (plane >= 0).any():
-            stream = true_ranges(recorded, state)
+            stream = true_points(recorded, state)
             some = AssociatedPoints(stream, thinned(plane), np.zeros((association.count, 6)))
             moments = take_moments(some, motion, LidarNoise(1.0), COARSE_BIN_S)
             _add_in_world(moments, motion, stream, sums)
@@ -395,7 +395,7 @@ def associate(
 ) -> AssociatedPlanes:
     """Planes and their points at the state of `motion`. A plane gets the name of the plane in `before` with which it
     shares most points. Points on the `sheet` are on no other plane. Raises EstimationError if there is no plane."""
-    streams = [true_ranges(s, motion.state) for s in streams]
+    streams = [true_points(s, motion.state) for s in streams]
     step = odd_step(sum(len(s.xyz) for s in streams))
     thinned = [in_world(motion, _every(step, s)) for s in streams]
     away = [sheet and sheet.away(*cloud, search, MIN_PLANE_POINTS) for cloud in thinned]
