@@ -75,13 +75,14 @@ def test_noise_is_along_the_beam_and_of_the_size_stated(robot, quiet):
 
 
 def test_errors_of_ranges_and_elevations(robot, quiet):
-    lidar, off_deg = robot.of(SimLidar)[0], 0.1 * np.arange(8)
-    bent = replace(lidar, range_offset_m=0.03, elevation_errors_deg=tuple(off_deg))
+    lidar, off_deg, off_m = robot.of(SimLidar)[0], 0.1 * np.arange(8), 0.01 * np.arange(8)
+    rings = {"elevation_errors_deg": tuple(off_deg), "ring_offsets_m": tuple(off_m)}
+    bent = replace(lidar, range_offset_m=0.03, **rings)
     sensors = tuple(bent if s is lidar else s for s in robot.sensors)
     sim = simulate(replace(quiet.scenario, sensors=sensors), 4)
     xyz = sim.measurements.lidars[0].xyz.astype(np.float64).reshape(-1, 180, 8, 3)
     level, off = np.hypot(xyz[..., 0], xyz[..., 1]), np.deg2rad(off_deg)
-    true = (np.linalg.norm(xyz, axis=3) - 0.03)[..., None] * np.stack(
+    true = (np.linalg.norm(xyz, axis=3) - 0.03 - off_m)[..., None] * np.stack(
         [
             xyz[..., 0] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
             xyz[..., 1] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
