@@ -317,8 +317,8 @@ def _rings(lidar: SimLidar, size: float) -> tuple[float, ...]:
 
 
 def outside(scenario: Scenario, kind: Kind) -> Iterator[Outside]:
-    """All effects on a rig; of several sensors of one kind the first has them."""
-    for sensor in (*scenario.cameras[:1], *scenario.sensors):
+    """All effects on a rig; of several cameras one has them. The motion is such that the first looks at the target."""
+    for sensor in (*scenario.cameras[-1:], *scenario.sensors):
         seen = sensor.name if kind.imu else ""  # else it may be any: motion is relative to one of them
         yield from _of_clock(sensor.name, seen)
         if not isinstance(sensor, SimWheels):  # a robot moves as its wheels do, wherever these are
@@ -371,7 +371,9 @@ def _of_lidar(lidar: SimLidar) -> Iterator[Outside]:
     offset = _with(lidar.name, range_offset_m=lambda _, x: x)
     yield Outside("range offset", 0.01, 0.1, "m", "range_offset|ranges_offset", offset)
     scale = _with(lidar.name, scale=lambda _, x: 1.0 + x)
-    yield Outside("range scale", 1e-3, 0.03, "", "range_scale_estimated|ranges_contradict", scale)
+    yield Outside(
+        "range scale", 1e-3, 0.03, "", "range_scale_estimated|ranges_contradict|lengths_contradict: the ranges", scale
+    )
     rings = _with(lidar.name, elevation_errors_deg=lambda _, x: _rings(lidar, x))
     yield Outside("elevations of rings", 0.1, 0.5, "deg", "ring_elevations", rings)
     offsets = _with(lidar.name, ring_offsets_m=lambda _, x: _rings(lidar, x))

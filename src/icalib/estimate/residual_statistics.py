@@ -203,10 +203,10 @@ class Segments:
         """Information (n, n) and gradient (n,) of the B calibration parameters and, in each segment, of a further part
         of m of them, those with `columns`; n = B + G m. The joint trajectory is eliminated, priors are included."""
         problem, state, B, m = self.problem, self.state, self.problem.layout.size, len(columns)
-        own, plain = B + np.arange(self.count * m).reshape(self.count, m), problem.without_tracks()
+        repeats, plain = B + np.arange(self.count * m).reshape(self.count, m), problem.without_tracks()
         scratch, n = problem.residuals(), B + self.count * m
         of_column = np.tile(np.append(np.arange(B), -1), (self.count, 1))
-        of_column[:, columns] = own
+        of_column[:, columns] = repeats
         tracks = [(key, f.by_segment(self.ends, of_column)) for key, f in problem.tracks.items()]
 
         def columns_of(g: int) -> tuple[PieceGradient, PieceGradient]:
@@ -217,9 +217,9 @@ class Segments:
 
         def piece_between(first: int, last: int) -> Piece:
             piece = plain.piece_with_columns(state, first, last, n - B, scratch)
-            for part, (repeated, gradient) in zip(own, of_segments, strict=True):
-                if repeated.add(piece, part):
-                    piece.calib[np.ix_(part, part)] += repeated.calib[columns]
+            for part, (information, gradient) in zip(repeats, of_segments, strict=True):
+                if information.add(piece, part):
+                    piece.calib[np.ix_(part, part)] += information.calib[columns]
                     piece.calib[part, n] += gradient.calib[columns]
                 gradient.add(piece, n)
             piece.side[:, :, columns] = piece.calib[columns] = piece.calib[:, columns] = 0.0  # all are in segments
@@ -230,8 +230,8 @@ class Segments:
 
         whole = problem.marginal(piece_between)
         whole = np.triu(whole) + np.triu(whole, 1).T
-        whole[columns] = whole[own].sum(axis=0)
-        whole[:, columns] = whole[:, own].sum(axis=1)
+        whole[columns] = whole[repeats].sum(axis=0)
+        whole[:, columns] = whole[:, repeats].sum(axis=1)
         information, gradient = whole[:-1, :-1], whole[:-1, -1]
         _, pull, known = sums_of_priors(problem.priors, state, B)
         information[:B, :B] += known

@@ -56,10 +56,18 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
-    if not against and (drifts or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
-        known = [*stated, *varying_causes(assessed, misfit)]
+    mean = {key for c in stated for key in c.explains} & _may_change(assessed.inputs)  # of what may have changed
+    if not against and (drifts or mean or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
+        varying = list(varying_causes(assessed, misfit))
+        changed = {key for c in varying for key in c.explains}
+        known = [*varying, *(c for c in stated if not changed.intersection(c.explains))]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
+
+
+def _may_change(inputs: Inputs) -> set[Key]:
+    """Groups of parameters that may change during a recording."""
+    return {(s.name, name) for s in inputs.sensors for names in s.may_change for name in names}
 
 
 def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
@@ -96,7 +104,7 @@ def _contradicted(
     for c in against:
         gain = np.inf if relaxed_rig is None else float(((c.off / (c.sigma / scale)) ** 2).max())
         moves = relaxed_rig is not None and _moves_others(assessed, relaxed_rig, c.key)
-        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves)
+        yield Cause(stated_words(assessed.inputs, c), gain, grave or moves, (c.key,))
     yield from (Cause(s, 0.0, grave) for s in absurd_values(assessed.inputs, against, assessed.groups))
 
 
@@ -227,7 +235,8 @@ def _change(tried: Changes, assessed: AssessedEstimate, misfit: Misfit) -> Itera
         words = _change_words(alike, assessed)
         share = min(best.gain / tried.scatter.beyond_chance, 1.0)
         words = words.with_sentence(f"{words} This explains {share:.0%} of what varies over the recording.")
-        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, assessed.beside[0]))
+        keys = tuple((sensor, c.name) for c in alike for sensor in c.sensors)
+        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, assessed.beside[0]), keys)
 
 
 def _is_large(c: Change, problem: Problem) -> bool:
