@@ -376,6 +376,8 @@ def _of_lidar(lidar: SimLidar) -> Iterator[Outside]:
     )
     rings = _with(lidar.name, elevation_errors_deg=lambda _, x: _rings(lidar, x))
     yield Outside("elevations of rings", 0.1, 0.5, "deg", "ring_elevations", rings)
+    azimuths = _with(lidar.name, azimuth_errors_deg=lambda _, x: _rings(lidar, x))
+    yield Outside("azimuths of rings", 0.1, 0.5, "deg", "ring_azimuths", azimuths)
     offsets = _with(lidar.name, ring_offsets_m=lambda _, x: _rings(lidar, x))
     yield Outside("offsets of rings", 0.01, 0.04, "m", "ring_offsets", offsets)
 

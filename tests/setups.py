@@ -41,11 +41,13 @@ from icalib.sensors.lidar.residual import LidarFactor
 from icalib.sensors.lidar.simulate import SimLidar
 from icalib.tools.simulation import Scenario, Simulation, handheld, load_scenario, simulate
 
+RINGS = "ring_elevations", "ring_offsets", "ring_azimuths"
 TOLERANCE = {
     "range_offset": 5e-3,
     "range_scale": 1e-2,
     "ring_elevations": 2e-3,
     "ring_offsets": 5e-3,
+    "ring_azimuths": 2e-3,
     "gravity": 0.01,
     "rotation": 2e-3,
     "translation": 5e-3,
@@ -336,9 +338,9 @@ class RoomSetup:
         lidar = self.factor(start, noise, **options)
         sensors = ImuSensor("imu0", "", class_noise("consumer")), Lidar(self.stream.name, "")
         tolerance = tolerance_of(self.layout, specs_of(self.layout, sensors), Settings())
-        # One ring has no offset of its own, so that nothing but a prior holds that number.
-        offsets = (b for b in self.layout.free if b.name == "ring_offsets")
-        priors = tuple(Prior(b, np.zeros(b.size), np.full(b.size, 10.0)) for b in offsets)
+        # One ring has no offset of its own, and the mean azimuth is a rotation: nothing but priors holds these numbers.
+        rings = (b for b in self.layout.free if b.name in ("ring_offsets", "ring_azimuths"))
+        priors = tuple(Prior(b, np.zeros(b.size), np.full(b.size, 10.0)) for b in rings)
         return Problem(self.layout, keyed((imu, lidar)), priors, tolerance, framed=False)
 
 
@@ -370,7 +372,7 @@ def make_room(
     entries.append((stream.name, "clock_rate", "vector", 1, drifts))
     entries.append((stream.name, "range_offset", "vector", 1, sheet))
     entries.append((stream.name, "range_scale", "vector", 1, sheet or drifts))
-    entries.extend((stream.name, name, "vector", 16, rings) for name in ("ring_elevations", "ring_offsets"))
+    entries.extend((stream.name, name, "vector", 16, rings) for name in RINGS)
     if sheet:
         assert used[0] == 0, "the first face of a room is its floor"
         planes = ((BOARD, "tilt"), *planes[1:])
@@ -384,7 +386,7 @@ def make_room(
     }
     values |= {(stream.name, name): np.zeros(1) for name in ("range_offset", "range_scale", "clock_rate")}
     values[stream.name, MIDDLE] = stream.seconds[-1:] / 3.0
-    values |= {(stream.name, name): np.zeros(16) for name in ("ring_elevations", "ring_offsets")}
+    values |= {(stream.name, name): np.zeros(16) for name in RINGS}
     values[stream.name, "rotation"], values[stream.name, "translation"] = T[:3, :3].copy(), T[:3, 3].copy()
     faces = not_none(sim.scenario.room).faces
     for key, k in zip(planes, used, strict=True):

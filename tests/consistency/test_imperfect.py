@@ -16,6 +16,7 @@ from icalib.pipeline import calibrate_measurements
 from icalib.rig import Parameter
 from icalib.sensors.imu.spec import class_imperfections
 from icalib.sensors.lidar.simulate import SimLidar
+from icalib.sensors.lidar.spec import RING_AZIMUTHS
 from icalib.sensors.pose.simulate import SimPoses
 from icalib.tools.simulation import Scenario, handheld, rig_for, simulate
 
@@ -227,6 +228,21 @@ def test_offsets_of_rings_are_found(program: ModuleType):
     assert max(x for _, verdict, x in program.errors(result, simulation) if verdict == "determined") < 4.0
 
 
+def test_azimuths_of_rings_are_found(program: ModuleType):
+    """0.2 deg RMS. Their mean is a rotation of the LiDAR, whose standard deviation has that of the prior."""
+    kind, off = program.KINDS["LiDAR + IMU"], 0.2 * np.random.default_rng(8).standard_normal(16)
+    scenario = kind.scenario()
+    lidars = (replace(x, azimuth_steps=225, azimuth_errors_deg=tuple(off)) for x in scenario.of(SimLidar))
+    simulation = simulate(scenario.with_sensors(*lidars), 1)
+    result = calibrate_measurements(program.rig_of(scenario, kind), simulation.measurements.unassociated())
+    assert result.verdict.startswith("usable")
+    assert [str(note)[:13] for note in result.notes if note.name == "ring_errors_estimated"] == ["ring azimuths"]
+    rings = result.group("lidar0", "ring_azimuths").value
+    assert np.abs(rings - rings.mean() - np.deg2rad(off - off.mean())).max() < np.deg2rad(0.02)
+    yaw = result.group("lidar0", "rotation").std
+    assert 0.9 < 4.0 * yaw.max() / RING_AZIMUTHS.prior_sigma < 2.0
+
+
 @pytest.mark.parametrize("rig_type", ["LiDAR + IMU", "LiDAR + poses + IMU"])
 def test_right_rings_are_left_alone(program: ModuleType, rig_type: str):
     kind = program.KINDS[rig_type]
@@ -234,7 +250,11 @@ def test_right_rings_are_left_alone(program: ModuleType, rig_type: str):
     scenario = scenario.with_sensors(*(replace(x, azimuth_steps=225) for x in scenario.of(SimLidar)))
     measured = simulate(scenario, 1).measurements.unassociated()
     result = calibrate_measurements(program.rig_of(scenario, kind), measured)
-    for name, most in (("ring_elevations", np.deg2rad(0.01)), ("ring_offsets", 2e-3)):
+    for name, most in (
+        ("ring_elevations", np.deg2rad(0.01)),
+        ("ring_offsets", 2e-3),
+        ("ring_azimuths", np.deg2rad(0.03)),
+    ):
         tested = result.effects[f"lidar0.{name}"]
         assert (np.abs(tested["value"]) < 4.0 * np.array(tested["std"])).all()
         assert sorted(tested["std"])[-2] < most  # one ring has no offset of its own

@@ -440,7 +440,7 @@ def lidar_sample(
     n_rings = of_rings.shape[1]
     # What the points have beyond the four rows of their entry, of which no pose knows.
     products = of_rings[:, :, 5:].sum(axis=0).T  # by the second error, of the first
-    same_ring = np.tile(np.eye(16), (2, 2)) if rings else np.zeros((0, 0))
+    same_ring = np.tile(np.eye(16), (3, 3)) if rings else np.zeros((0, 0))
     beyond = same_ring * np.repeat(products, 16, axis=0)[:n_rings]
     beyond = beyond - np.einsum("ekc,elc->kl", of_rings[:, :, :4], of_rings[:, :, :4])
     squares, axes = np.linalg.eigh(beyond)  # of bands without a ring 0

@@ -106,6 +106,8 @@ def test_every_parameter_has_its_labels_and_a_tolerance(sensor: Sensor):
 
 def drawn(spec: ParameterSpec) -> Parameter:
     value = np.eye(3) if spec.manifold == "rotation" else 0.1 + np.arange(spec.size)
+    if spec.largest < np.inf:
+        value *= 0.5 * spec.largest / value.max()
     return Parameter("prior", value, 0.01 + 0.1 * np.arange(spec.size))
 
 

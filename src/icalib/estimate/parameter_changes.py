@@ -58,7 +58,8 @@ class Candidate:
 class Change:
     """Tested change of a candidate. second: time of a step, middle of a segment that differs, or of the recording for a
     drift [s, joined clock]. value, sigma (n,): change over the recording [SI, or px]. gain: decrease of chi^2; count:
-    number of directions that are determined; rival: largest gain of another pattern of the same parameters."""
+    number of directions that are determined; rival: largest gain of another pattern of the same parameters; step: time
+    of the best step of these."""
 
     sensors: tuple[str, ...]
     name: str
@@ -69,6 +70,7 @@ class Change:
     gain: float
     count: int
     rival: float = 0.0
+    step: float = 0.0
 
     @property
     def parameters(self) -> tuple[tuple[str, ...], str]:
@@ -127,19 +129,22 @@ NO_CHANGES = Changes((), Scatter(0.0, 0.0))
 
 def changes(problem: Problem, state: State, sensors: Sequence[Sensor]) -> Changes:
     """Changes of the parameters of `sensors`. Target, planes and IMU are the reference for the others; the clock of the
-    IMU is that which all others share. None is found in a recording that is too short for segments."""
+    IMU is that which all others share. None is found in a recording that is too short for segments. None is clear if
+    shorter segments around it show another."""
     parts, candidates = Segments.between(problem, state, INSTANTS), list(_candidates(problem, sensors))
     if parts is None or not candidates:
         return NO_CHANGES
     coarse = _by_gain(parts, candidates, 2)
     best, chance = coarse.by_gain[0], coarse.scatter.beyond_chance
     may_be_clear = SHORTER * best.gain >= MIN_CHANGE_SHARE * chance and best.gain > least_chi2(best.count)
-    if best.pattern == "drift" or not may_be_clear:
+    if best.is_clock_drift or not may_be_clear:
         return coarse
-    fine = _by_gain(Segments.at(problem, state, _shorter_around(best.second, parts)), candidates, 1)
+    near = best.step if best.pattern == "drift" else best.second
+    fine = _by_gain(Segments.at(problem, state, _shorter_around(near, parts)), candidates, 1)
     if fine.clear is not None and fine.clear.gain >= MOST * max(fine.scatter.beyond_chance, chance):
         return fine
-    return coarse if fine.by_gain[0].parameters == best.parameters else NO_CHANGES
+    is_same = fine.by_gain[0].parameters == best.parameters
+    return coarse if is_same else coarse._replace(scatter=Scatter(np.inf, 0.0))
 
 
 def _shorter_around(second: float, parts: Segments) -> np.ndarray:
@@ -161,7 +166,7 @@ def _by_gain(parts: Segments, candidates: Sequence[Candidate], together: int) ->
         for change in _tested(parts, form, candidate):
             by_pattern[change.pattern] = max(by_pattern.get(change.pattern, change), change, key=lambda c: c.gain)
         best, second, *_ = sorted(by_pattern.values(), key=lambda c: -c.gain)
-        best_changes.append(replace(best, rival=second.gain))
+        best_changes.append(replace(best, rival=second.gain, step=by_pattern["step"].second))
     return Changes(tuple(sorted(best_changes, key=lambda c: least_chi2(c.count) - c.gain)), form.scatter(together))
 
 

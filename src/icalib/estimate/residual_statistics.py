@@ -114,7 +114,7 @@ class PieceGradient(NamedTuple):
 
 @dataclass(frozen=True)
 class Segments:
-    """Segments of `problem` at `state`; feature tracks are cut at their ends. ends (G + 1,): keyframes that bound the
+    """Segments of `problem` at `state`; `of` cuts feature tracks at their ends. ends (G + 1,): keyframes that bound the
     segments.
 
     sums (G, B + 1, B + 1): information of each segment alone on the calibration parameters, its gradient in the last

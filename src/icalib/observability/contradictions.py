@@ -2,7 +2,7 @@
 
 Each value is first tested alone by one Newton step (`relaxed`). Values that fail are then freed together, in one
 more Newton step in which unobservable directions stay fixed; a value that agrees there is dropped. If a value is far
-off, the whole calibration is repeated with all of them free instead."""
+off, and does not agree there, the whole calibration is repeated with all of them free."""
 
 from __future__ import annotations
 

@@ -453,8 +453,14 @@ class Effect:
 
     @property
     def prior_sigma(self) -> float:
-        """Standard deviation of the prior with which it is estimated: the next power of ten, or the usual one."""
-        return max(float(10.0 ** np.ceil(np.log10(np.abs(self.value).max()))), self.spec.prior_sigma)
+        """Standard deviation of the prior with which it is estimated: the usual one, or of a single number the next
+        power of ten. Priors alone may hold the mean of several."""
+        usual_sigma = self.spec.prior_sigma
+        return (
+            usual_sigma
+            if len(self.value) > 1
+            else max(10.0 ** float(np.ceil(np.log10(abs(self.value[0])))), usual_sigma)
+        )
 
 
 class EffectsLeftOut(NamedTuple):
@@ -591,9 +597,9 @@ class _FreedEstimate:
     def _scatter(self, step: np.ndarray, root: np.ndarray, freed: Inputs) -> np.ndarray | None:
         """(B,) ratios of standard deviations, by the scatter of segments after `step` and by white noise; at least that
         of all parameters that matter together. None without segments."""
-        before, shortly = self._segments(step, 0.0, freed), self._segments(step, SHORTLY, freed)
-        if before is None or shortly is None:
+        if (before := self._segments(step, 0.0, freed)) is None:
             return None
+        shortly = self._segments(step, SHORTLY, freed) or before
         gradients = before.gradients + (shortly.gradients - before.gradients) / SHORTLY
         outcome = self._outcome(self.state)
         white = noise_variance(self.problem, outcome)

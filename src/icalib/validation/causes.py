@@ -56,11 +56,12 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
-    mean = {key for c in stated for key in c.explains} & _may_change(assessed.inputs)  # of what may have changed
+    values = [c for c in stated if c.remedy is None]  # that are wrong; each may be the mean of one that changes
+    mean = {key for c in values for key in c.explains} & _may_change(assessed.inputs)
     if not against and (drifts or mean or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
         varying = list(varying_causes(assessed, misfit))
         changed = {key for c in varying for key in c.explains}
-        known = [*varying, *(c for c in stated if not changed.intersection(c.explains))]
+        known = [*varying, *(c for c in stated if c not in values or not changed.intersection(c.explains))]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 
@@ -278,9 +279,9 @@ def _changed(c: Change, problem: Problem, state: State) -> tuple[Remark, str]:
         return size, "Check tyres, load and encoders."
     turn, move = _sizes(problem.layout, c)
     moves, advice = f"it moves on its mount by {np.rad2deg(turn):.2g} deg and {1e3 * move:.2g} mm", "Fasten all mounts."
-    if c.name == "translation":  # of an antenna: the two are hard to tell apart
+    if not problem.layout.has(c.sensors[0], "rotation"):  # of an antenna: the two are hard to tell apart
         moves = f"it moves on its mount by {1e3 * move:.2g} mm, or its positions jump"
-        advice = "Fasten all mounts, and leave out fixes of a low status (least_status)."
+        advice = "Fasten all mounts; of GNSS, leave out fixes of a low status (least_status)."
     return Remark("mount_moves", moves), advice
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.cases import each
+from tests.setups import RINGS
 from tests.typed import not_none
 
 from icalib.errors import EstimationError
@@ -142,8 +143,8 @@ def test_sums_are_those_of_the_points(sparse_room, room_of, dense, bin_s, loss, 
 
 @each("beam", [0.0, 0.03])
 def test_errors_of_rings_move_their_points(sparse_room, room_of, dense, beam):
-    """Against points that are moved one by one, by 1 mrad up and down, and by 1 mm nearer and farther. The ring with
-    most points has no offset of its own."""
+    """Against points that are moved one by one, by 1 mrad up, down and sideways, and by 1 mm nearer and farther. The
+    ring with most points has no offset of its own."""
     setup = room_of(sparse_room, spacing=0.05, rings=True)
     state, noise, bin_s, h = setup.perturbed(np.random.default_rng(0), 0.1), LidarNoise(0.1, beam), 1e-4, 1e-3
     factor = setup.factor(state, noise, bin_s=bin_s)
@@ -154,7 +155,7 @@ def test_errors_of_rings_move_their_points(sparse_room, room_of, dense, beam):
     ring, sigma = rings_of_points(setup)[setup.plane >= 0], np.hypot(noise.sigma, beam * point.incidence)
     assert (np.abs(point.r) / sigma).max() < 4.0
     slope, columns = np.zeros(len(g)), o + setup.layout.columns("lidar0", *RINGS)
-    for name, step in zip(RINGS, h * np.eye(2)[:, :, None], strict=True):
+    for name, step in zip(RINGS, h * np.eye(3)[:, :, None], strict=True):
         up, down = (pointwise(corrected(setup, *(off + sign * step)), state, bin_s) for sign in (1.0, -1.0))
         own = o + setup.layout.columns("lidar0", name)
         point.J[:, own] = (ring[:, None] == np.arange(16)) * ((up.r - down.r) / (2.0 * h))[:, None]
@@ -172,13 +173,10 @@ def test_errors_of_rings_move_their_points(sparse_room, room_of, dense, beam):
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3 * np.sqrt(len(ring)))
 
 
-RINGS = "ring_elevations", "ring_offsets"
-
-
 def test_corrected_rings_are_moved_one_by_one(sparse_room, room_of):
     """Of a part of the points, too, which does not have all rings."""
     setup = room_of(sparse_room)
-    off = np.random.default_rng(1).normal(size=(2, 16)) * 0.01
+    off = np.random.default_rng(1).normal(size=(3, 16)) * 0.01
     values = {("lidar0", RINGS_SEEN): rings_seen(setup.stream)} | {
         ("lidar0", x): v for x, v in zip(RINGS, off, strict=True)
     }
@@ -190,6 +188,20 @@ def test_corrected_rings_are_moved_one_by_one(sparse_room, room_of):
     )
 
 
+def test_a_point_on_the_axis_has_no_azimuth(sparse_room, room_of):
+    """It was nan, and refused the recording."""
+    setup = room_of(sparse_room, rings=True)
+    xyz = setup.stream.xyz.copy()
+    xyz[0] = [0.0, 0.0, 2.0]
+    stream = replace(setup.stream, xyz=xyz)
+    setup = replace(setup, sim=replace(setup.sim, measurements=setup.sim.measurements.with_streams(stream)))
+    rings = setup.factor(setup.state, LidarNoise(0.1)).moments.rings
+    assert rings.any() and np.isfinite(rings).all()
+    values = {("lidar0", x): np.full(16, 1e-3) for x in RINGS}
+    state = replace(setup.state, values=setup.state.values | values)
+    np.testing.assert_allclose(true_rings(stream, state).xyz[0], [0.0, 0.0, 1.999], atol=1e-5)
+
+
 def rings_of_points(setup):
     """(N,) band of each point, of 16: 8 rings are in the nearest one."""
     x, y, z = setup.stream.xyz.astype(np.float64).T
@@ -197,11 +209,12 @@ def rings_of_points(setup):
     return np.array([0, 2, 4, 6, 9, 11, 13, 15])[ring]
 
 
-def corrected(setup, turn, too_far):
-    """The setup with points turned by `turn` (16,) and nearer by `too_far` (16,), the errors of their rings."""
+def corrected(setup, turn, too_far, about):
+    """The setup with points turned up by `turn` (16,) and about z by `about` (16,), and nearer by `too_far` (16,), the
+    errors of their rings."""
     x, y, z = setup.stream.xyz.astype(np.float64).T
     ring = rings_of_points(setup)
-    level, elevation = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y)) + turn[ring]
+    level, elevation = np.arctan2(y, x) + about[ring], np.arctan2(z, np.hypot(x, y)) + turn[ring]
     r = np.linalg.norm([x, y, z], axis=0) - too_far[ring]
     xyz = r * np.array([np.cos(elevation) * np.cos(level), np.cos(elevation) * np.sin(level), np.sin(elevation)])
     stream = replace(setup.stream, xyz=xyz.T.astype(np.float32))

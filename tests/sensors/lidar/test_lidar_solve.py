@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from tests.setups import RINGS
 from tests.typed import not_none
 
 from icalib.detection.planes import PlaneSearch, find_planes
@@ -64,17 +65,23 @@ def test_noiseless_recovery(robot_scenario, room_of):
 
 
 def test_errors_of_rings_are_recovered_without_noise(robot_scenario, room_of):
-    """0.2 deg and 2 cm RMS. Corrected points are float32, wrong by up to 6e-8 of their distance."""
-    off = np.random.default_rng(5).standard_normal((2, 16)) * [[0.2], [0.02]]
+    """0.2 deg twice and 2 cm RMS. Corrected points are float32, wrong by up to 6e-8 of their distance."""
+    off = np.random.default_rng(5).standard_normal((3, 16)) * [[0.2], [0.02], [0.2]]
     off[1, 0] = 0.0  # of the rings, which all have as many points, the first has no offset of its own
-    rings = {"elevation_errors_deg": tuple(off[0]), "ring_offsets_m": tuple(off[1])}
+    off[2] -= off[2].mean()  # which is a rotation of the LiDAR
+    rings = {
+        "elevation_errors_deg": tuple(off[0]),
+        "ring_offsets_m": tuple(off[1]),
+        "azimuth_errors_deg": tuple(off[2]),
+    }
     scenario = robot_scenario(3.0, noiseless=True, azimuth_steps=600, **rings)
     scenario = replace(scenario, imu_rate_hz=8000.0, gyro_bias=(0.0,) * 3, accel_bias=(0.0,) * 3)
     setup = room_of(simulate(scenario, seed=1), spacing=5e-3, rings=True)
     outcome = not_none(recover(setup, setup.state, LidarNoise(0.03), 3, bin_s=1e-4))
-    elevations, offsets = (outcome.state.values["lidar0", name] for name in ("ring_elevations", "ring_offsets"))
+    elevations, offsets, azimuths = (outcome.state.values["lidar0", name] for name in RINGS)
     assert np.abs(elevations - np.deg2rad(off[0])).max() < 1e-7
     assert np.abs(offsets - off[1]).max() < 1e-6
+    assert np.abs(azimuths - np.deg2rad(off[2])).max() < 1e-6
     assert np.abs(errors(setup, outcome.state)).max() < 1e-6
 
 

@@ -74,9 +74,13 @@ def test_noise_is_along_the_beam_and_of_the_size_stated(robot, quiet):
     assert abs(along.mean()) < 4.0 * 0.03 / np.sqrt(n)
 
 
-def test_errors_of_ranges_and_elevations(robot, quiet):
+def test_errors_of_ranges_and_angles(robot, quiet):
     lidar, off_deg, off_m = robot.of(SimLidar)[0], 0.1 * np.arange(8), 0.01 * np.arange(8)
-    rings = {"elevation_errors_deg": tuple(off_deg), "ring_offsets_m": tuple(off_m)}
+    rings = {
+        "elevation_errors_deg": tuple(off_deg),
+        "ring_offsets_m": tuple(off_m),
+        "azimuth_errors_deg": tuple(2.0 * off_deg),
+    }
     bent = replace(lidar, range_offset_m=0.03, **rings)
     sensors = tuple(bent if s is lidar else s for s in robot.sensors)
     sim = simulate(replace(quiet.scenario, sensors=sensors), 4)
@@ -84,8 +88,8 @@ def test_errors_of_ranges_and_elevations(robot, quiet):
     level, off = np.hypot(xyz[..., 0], xyz[..., 1]), np.deg2rad(off_deg)
     true = (np.linalg.norm(xyz, axis=3) - 0.03 - off_m)[..., None] * np.stack(
         [
-            xyz[..., 0] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
-            xyz[..., 1] / level * np.cos(np.arctan2(xyz[..., 2], level) + off),
+            np.cos(np.arctan2(xyz[..., 1], xyz[..., 0]) + 2.0 * off) * np.cos(np.arctan2(xyz[..., 2], level) + off),
+            np.sin(np.arctan2(xyz[..., 1], xyz[..., 0]) + 2.0 * off) * np.cos(np.arctan2(xyz[..., 2], level) + off),
             np.sin(np.arctan2(xyz[..., 2], level) + off),
         ],
         axis=3,

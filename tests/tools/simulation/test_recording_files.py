@@ -123,7 +123,7 @@ def test_the_truth_is_beside_the_tables(simulation, folder):
 def test_the_truth_has_all_effects(simulation, tmp_path):
     scenario = replace(simulation.scenario, duration_s=1.0, imu_accel_delay_s=2e-3, imu_cutoff_hz=20.0)
     off = tuple(0.1 * np.arange(scenario.of(SimLidar)[0].rings))
-    rings = {"elevation_errors_deg": off, "ring_offsets_m": off}
+    rings = {"elevation_errors_deg": off, "ring_offsets_m": off, "azimuth_errors_deg": off}
     lidars = (replace(x, range_offset_m=0.02, **rings) for x in scenario.of(SimLidar))
     write_tables(simulate(scenario.with_sensors(*lidars), 3), 3, tmp_path / "run")
     imu, lidar = (
@@ -131,7 +131,7 @@ def test_the_truth_has_all_effects(simulation, tmp_path):
     )
     assert (imu["accel_delay"], imu["cutoff"], lidar["range_offset"]) == (2e-3, 20.0, 0.02)
     assert imu["low_pass"] == pytest.approx(0.5 * (np.sqrt(np.log(2.0)) / (2.0 * np.pi * 20.0)) ** 2)
-    assert lidar["ring_offsets"] == list(off)
+    assert lidar["ring_offsets"] == list(off) and lidar["ring_azimuths"] == pytest.approx(np.deg2rad(off))
     bands = lidar["ring_elevations"]  # 16: others have no ring
     assert (len(bands), [x for x in bands if x]) == (16, pytest.approx(np.deg2rad(off[1:])))
 

@@ -307,6 +307,7 @@ EFFECTS = """effects:
   range_offset: {top: 0.02}
   ring_offsets: {top: [0.01, 0.02, -0.01, 0.0]}
   ring_elevations: {top: [0.1, 0.2, 0.3, 0.4]}
+  ring_azimuths: {top: [0.5, 0.6, 0.7, 0.8]}
 """
 LATE = "effects: {imu: {accel_delay: 0.002, cutoff: 40}}\n"
 
@@ -319,7 +320,7 @@ def test_effects_are_read(tmp_path):
     assert [p.scale for p in scenario.of(SimPoses)] == [0.99] and scenario.target_size == 1.01
     lidar = scenario.of(SimLidar)[0]
     assert (lidar.range_offset_m, lidar.elevation_errors_deg) == (0.02, (0.1, 0.2, 0.3, 0.4))
-    assert lidar.ring_offsets_m == (0.01, 0.02, -0.01, 0.0)
+    assert (lidar.ring_offsets_m, lidar.azimuth_errors_deg) == ((0.01, 0.02, -0.01, 0.0), (0.5, 0.6, 0.7, 0.8))
     late = loaded(tmp_path, LATE + FULL)
     assert (late.imu_accel_delay_s, late.imu_cutoff_hz) == (0.002, 40.0)
 
@@ -332,6 +333,7 @@ def test_effects_are_read(tmp_path):
         ("1.01", "0.01", "effects.target_size: is true over stated length"),
         ("0.02}", "2}", "effects.range_offset.top: must be between -0.5 and 0.5, but is 2."),
         (", 0.4]", "]", "top has 4 rings, but 3 elevation errors; give one for each ring."),
+        (", 0.8]", "]", "top has 4 rings, but 3 azimuth errors; give one for each ring."),
         (", 0.0]", "]", "top has 4 rings, but 3 ring offsets; give one for each ring."),
         ("-0.01, 0.0]", "-1, 0.0]", "effects.ring_offsets.top[2]: must be between -0.5 and 0.5, but is -1."),
         ("accel_scale: [0.01, 0.02, 0.03]", "cutoff: 1.0e-9", "effects.imu.cutoff: must be at least 1, but is 1e-09."),

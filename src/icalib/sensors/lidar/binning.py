@@ -85,9 +85,10 @@ class Moments:
     seconds (n,): centres of the bins on the LiDAR's clock, since its first stamp; plane, count (E,): plane and number
     of points of each entry. root (E, 10): lower Cholesky factor L, row by row, of the moments sum w (1, x) (1, x)^T; w
     is the robust weight of a point over its variance. incidence (E, 4): incidence term, the change of half the chi^2
-    with the variances, incidence . (1, R_world_lidar^T n). rings (E, 2 K, 7) float32, K = 0 without rings: for points
-    of each ring that move by s_e off the plane per rad of elevation, and by s_o per m of offset, L^-1 sum w s (1, x),
-    the change of half the chi^2 with the variances, sum w s s_e, and sum w s s_o: s is s_e first, then s_o.
+    with the variances, incidence . (1, R_world_lidar^T n). rings (E, 3 K, 8) float32, K = 0 without rings: for points
+    of each ring that move by s_e off the plane per rad of elevation, by s_o per m of offset and by s_a per rad of
+    azimuth, L^-1 sum w s (1, x), the change of half the chi^2 with the variances, and sum w s s_e, w s s_o and w s s_a:
+    s is s_e first, then s_o, then s_a.
     """
 
     seconds: np.ndarray
@@ -222,7 +223,8 @@ def points_on_planes(motion: EstimatedMotion, stream: LidarStream, plane: np.nda
 
 N_MOMENTS = 10  # products of (1, x, y, z), lower triangle row by row
 N_SUMS = N_MOMENTS + 3  # the moments, then the gradient of the incidence term
-N_ERRORS = len(OF_RINGS) * N_RINGS  # errors of rings, 2 K
+N_ERRORS = len(OF_RINGS) * N_RINGS  # errors of rings, 3 K
+LEAST_LEVEL_M = 1e-6  # from the LiDAR's z axis: a point on it has no azimuth
 RING_SUMS = 5 + len(OF_RINGS)  # numbers of each of them in an entry, see `Moments.rings`
 MAX_INCIDENCE_CHI2 = 16.0  # 4 sigma; larger values do not enter the incidence term: outliers, or an inaccurate state
 MIN_PIVOT = 1e-13  # relative to the diagonal moment; a smaller pivot is a rounding error of float64
@@ -402,30 +404,34 @@ def _add_points(points, begin, end, R, p, rate, velocity, m, weights, sums):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _add_rings(points, begin, end, R, p, rate, velocity, m, weights, rings):
-    """Adds the points of `_add_points` to rings (2 K, 7), see `Moments`, not yet times L^-1. A higher beam moves its
-    point by |x| per rad, across the beam, and an offset along it. Turns within the step are neglected there."""
+    """Adds the points of `_add_points` to rings (3 K, 8), see `Moments`, not yet times L^-1. A higher beam moves its
+    point by |x| per rad, across the beam, an offset along it, and an azimuth about the LiDAR's z axis. Turns within the
+    step are neglected there."""
     rate, velocity = (rate[0], rate[1], rate[2]), (velocity[0], velocity[1], velocity[2])
     for n in range(begin, end):
         x, y, z, dt = (np.float64(points[0, n]), np.float64(points[1, n]), np.float64(points[2, n]), points[3, n])
-        level = np.sqrt(x * x + y * y)
-        level_part, up_part = 0.0, 0.0
+        level = max(np.sqrt(x * x + y * y), LEAST_LEVEL_M)
+        level_part, up_part, sideways = 0.0, 0.0, 0.0
         for i in range(3):
             level_part += m[1 + i] * (R[i, 0] * x + R[i, 1] * y) / level
             up_part += m[1 + i] * R[i, 2]
-        moves = (up_part * level - level_part * z, -(level_part * level + up_part * z) / np.sqrt(level**2 + z**2))
+            sideways += m[1 + i] * (R[i, 1] * x - R[i, 0] * y)
+        along = (level_part * level + up_part * z) / np.sqrt(level**2 + z**2)
+        moves = (up_part * level - level_part * z, -along, sideways)
         a, b, c = _moved_by_twist(x, y, z, np.float64(dt), rate, velocity)
         x, y = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c + p[0], R[1, 0] * a + R[1, 1] * b + R[1, 2] * c + p[1]
         z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c + p[2]
         w, g = _weighed(x, y, z, m, weights)
-        for f in range(2):
+        for f in range(3):
             of_ring, s = rings[f * N_RINGS + int(points[4, n])], moves[f]
             of_ring[0] += w * s
             of_ring[1] += w * s * x
             of_ring[2] += w * s * y
             of_ring[3] += w * s * z
-            of_ring[4] -= g * s if f == 0 else 0.0  # an offset leaves incidences as they are
+            of_ring[4] -= g * s if f != 1 else 0.0  # an offset leaves incidences as they are
             of_ring[5] += w * s * moves[0]
             of_ring[6] += w * s * moves[1]
+            of_ring[7] += w * s * moves[2]
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -447,7 +453,7 @@ def _factorise(M):
 
 @njit(cache=True, nogil=True, inline="always")
 def _write_entry(c, q, number, m, sums, ring_sums, entries, total):
-    """Writes the entry of plane q in bin c at `total`: `number` points with the sums (13,), and (2 K, 7) of rings."""
+    """Writes the entry of plane q in bin c at `total`: `number` points with the sums (13,), and (3 K, 8) of rings."""
     bins, plane, count, root, incidence, rings = entries
     bins[total], plane[total], count[total] = c, q, number
     for k in range(N_MOMENTS):

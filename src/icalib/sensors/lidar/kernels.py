@@ -16,7 +16,7 @@ An entry is one plane in one bin. It has four whitened residuals L^T m. L L^T is
 and m . (1, x) is the distance of a point x from the plane. The sum of squares of the four residuals, and the products
 of their derivatives, equal those of all points of the entry.
 
-Errors delta of the elevations and offsets of rings move points by s . delta off the plane, which is not linear in
+Errors delta of elevations, offsets and azimuths of rings move points by s . delta off the plane, which is not linear in
 (1, x). With D = L^-1 sum w (1, x) s^T and sums over points and their weights w, the chi^2 of an entry becomes
 |L^T m + D delta|^2 + delta^T (sum w s s^T - D^T D) delta. The second part are residuals that no pose or plane changes.
 Rings share no point. Such errors are those since the start of a pass.
@@ -314,7 +314,7 @@ def _add_chain(k, first, last, J_pose, columns, plane_columns, work, sums):
 @njit(cache=True, nogil=True, inline="always")
 def _add_columns(J_rows, rings, n, plane_columns, gram_columns, sums):
     """Adds to the sums the products of an entry by the first n of the columns `plane_columns` (5 + K,) of its plane, of
-    the ranges and of the errors of rings (K, 7), see `Moments`, of which some may be fixed. Fills the first three of
+    the ranges and of the errors of rings (K, 8), see `Moments`, of which some may be fixed. Fills the first three of
     gram_columns (6, 5 + K), its products by the pose, and adds to the others."""
     B, n_b, n_others = J_rows, sums.calib.shape[0] - 1, PLANE_DIM + RANGE_DIM
     for i in range(POSE_DIM):
@@ -416,7 +416,7 @@ def _work_space(at, n_columns, n_rings):
 @njit(cache=True, nogil=True, inline="always")
 def _add_rings(rings, change, row, by_ring):
     """Adds changes (K,) of the errors of rings since the start of the pass to `row` (4,). Fills by_ring (K,), the
-    gradient of what the cost of the entry has beside its rows, and returns this. rings (K, 7): see `Moments`."""
+    gradient of what the cost of the entry has beside its rows, and returns this. rings (K, 8): see `Moments`."""
     cost, moved = 0.0, np.zeros(N_WHITENED)
     for k in range(len(rings)):
         for c in range(N_WHITENED):

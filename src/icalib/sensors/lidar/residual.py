@@ -30,7 +30,15 @@ from icalib.optim.arrowhead import Piece, in_parallel
 from icalib.optim.state import Key, Layout, Planes, State, plane_value
 from icalib.rig import Scheme
 from icalib.sensors.lidar import kernels
-from icalib.sensors.lidar.binning import BIN_S, NO_RINGS, AssociatedPoints, LidarNoise, Moments, take_moments
+from icalib.sensors.lidar.binning import (
+    BIN_S,
+    LEAST_LEVEL_M,
+    NO_RINGS,
+    AssociatedPoints,
+    LidarNoise,
+    Moments,
+    take_moments,
+)
 from icalib.sensors.lidar.kernels import N_WHITENED, Bins
 from icalib.sensors.lidar.spec import N_RINGS, OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 
@@ -83,19 +91,20 @@ def _bands(elevation: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def ring_errors(state: State, lidar: str) -> np.ndarray:
-    """(2 K,) elevations [rad], then offsets [m] of rings, in the order of OF_RINGS."""
+    """(3 K,) elevations [rad], offsets [m], and azimuths [rad] of rings, in the order of OF_RINGS."""
     return np.concatenate([state.values.get((lidar, x.name), np.zeros(N_RINGS)) for x in OF_RINGS])
 
 
 def true_rings(stream: LidarStream, state: State) -> LidarStream:
-    """The stream with corrected elevations and offsets of rings."""
+    """The stream with corrected rings."""
     if not (off := ring_errors(state, stream.name)).any():
         return stream
-    turn, offset = off.astype(np.float32).reshape(-1, N_RINGS)[:, rings_of(stream, state)]
+    turn, offset, azimuth = off.astype(np.float32).reshape(-1, N_RINGS)[:, rings_of(stream, state)]
     (x, y, z), shorter = stream.xyz.T, 1.0 - offset / np.linalg.norm(stream.xyz, axis=1)
-    level, up, along = np.hypot(x, y), shorter * np.sin(turn), shorter * np.cos(turn)
+    level, up, along = np.maximum(np.hypot(x, y), LEAST_LEVEL_M), shorter * np.sin(turn), shorter * np.cos(turn)
     ratio = along - up * z / level
-    return replace(stream, xyz=np.column_stack([x * ratio, y * ratio, z * along + level * up]))
+    x, y = ratio * (x * np.cos(azimuth) - y * np.sin(azimuth)), ratio * (x * np.sin(azimuth) + y * np.cos(azimuth))
+    return replace(stream, xyz=np.column_stack([x, y, z * along + level * up]))
 
 
 def true_points(stream: LidarStream, state: State) -> LidarStream:
@@ -110,7 +119,7 @@ class LidarFactor(RowFactor):
     keyframe (n,), increasing: keyframe from which the pose of each bin of `moments` is propagated. noise_angle (n,),
     J_rows_noise (E, 3, 4), J_incidence_noise (E, 3): see `Bins`, at the state from which the pass starts. planes: keys,
     in the values of a state, of the planes of the moments; that of a tilt stands for the sheet of the target. Points
-    have been corrected by the range_errors and ring_errors (2 K,) of the state from which the pass starts; the latter
+    have been corrected by the range_errors and ring_errors (3 K,) of the state from which the pass starts; the latter
     are empty if all are fixed.
     """
 
@@ -151,7 +160,7 @@ class LidarFactor(RowFactor):
         moments = take_moments(cloud, motion, noise, bin_s)
         if has_rings:  # that with most points has no offset of its own
             reference = int(rings_seen(stream, motion.state)[-1])
-            moments.rings[:, N_RINGS + reference] = moments.rings[:, reference, -1] = 0.0
+            moments.rings[:, N_RINGS + reference] = moments.rings[:, reference::N_RINGS, 6] = 0.0
         times = instants(stream, motion.state.values, moments.seconds)
         keyframe = assign_keyframes(scheme, motion.state.seconds, times, motion.imu.forwards)
         noise_angle = motion.imu.rotation_sigma(motion.state.seconds[keyframe], times)
@@ -179,7 +188,7 @@ class LidarFactor(RowFactor):
 
     @cached_property
     def _plane_columns(self) -> np.ndarray:
-        """(P, 5 + 2 K) calibration columns of each plane, see `Planes`. The distance of the target's sheet is known."""
+        """(P, 5 + 3 K) calibration columns of each plane, see `Planes`. The distance of the target's sheet is known."""
         errors = (RANGE_OFFSET, RANGE_SCALE, *(OF_RINGS if len(self.ring_errors) else ()))
         ranges = [self.layout.block(self.name, x.name).columns for x in errors]
         planes = (np.append(self.layout.block(*p).columns, -1)[: kernels.PLANE_DIM] for p in self.planes)

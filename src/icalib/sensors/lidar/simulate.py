@@ -14,7 +14,15 @@ from icalib.base.compiled import njit
 from icalib.base.yaml_nodes import YamlValue
 from icalib.data.measurements import LidarStream
 from icalib.errors import RigError
-from icalib.sensors.lidar.spec import N_RINGS, RANGE_OFFSET, RANGE_SCALE, RING_ELEVATIONS, RING_OFFSETS, Lidar
+from icalib.sensors.lidar.spec import (
+    N_RINGS,
+    RANGE_OFFSET,
+    RANGE_SCALE,
+    RING_AZIMUTHS,
+    RING_ELEVATIONS,
+    RING_OFFSETS,
+    Lidar,
+)
 from icalib.sensors.parameter import Parameter
 from icalib.tools.simulation.output import BagWriter
 from icalib.tools.simulation.room import Room, RoomSurfaces, nearest
@@ -48,18 +56,19 @@ class SimLidar(SimSensor):
     A scan is one turn of azimuth_steps columns with `rings` points, at elevations evenly over elevation_deg. The lasers
     of a column fire 2.304 us apart, or faster if a column is shorter. The stamp of a scan is the instant of its first
     column. Points outside range_m are missing. Noise is along the beam. scale: ratio of true to reported ranges.
-    range_offset_m: reported less true ranges; ring_offsets_m: of each ring, in addition. elevation_errors_deg: true
-    less reported elevation of each ring.
+    range_offset_m: reported less true ranges; ring_offsets_m: of each ring, in addition. elevation_errors_deg,
+    azimuth_errors_deg: true less reported angles of each ring.
     """
 
     sensor_type: ClassVar[str] = "lidar"
     random_stream: ClassVar[int] = 1000
     measures: ClassVar[str] = "scans"
     effects: ClassVar = {
-        "range_scale": ("scale", true_ratio),
-        "range_offset": ("range_offset_m", lambda value: limited(value, MAX_OFFSET_M)),
-        "ring_offsets": ("ring_offsets_m", lambda value: tuple(limited(x, MAX_OFFSET_M) for x in value.items())),
-        "ring_elevations": ("elevation_errors_deg", lambda value: tuple(x.number() for x in value.items())),
+        RANGE_SCALE.name: ("scale", true_ratio),
+        RANGE_OFFSET.name: ("range_offset_m", lambda value: limited(value, MAX_OFFSET_M)),
+        RING_OFFSETS.name: ("ring_offsets_m", lambda value: tuple(limited(x, MAX_OFFSET_M) for x in value.items())),
+        RING_ELEVATIONS.name: ("elevation_errors_deg", lambda value: tuple(x.number() for x in value.items())),
+        RING_AZIMUTHS.name: ("azimuth_errors_deg", lambda value: tuple(x.number() for x in value.items())),
     }
 
     rate_hz: float = 8.0
@@ -72,6 +81,7 @@ class SimLidar(SimSensor):
     range_offset_m: float = 0.0
     ring_offsets_m: tuple[float, ...] = (0.0,)
     elevation_errors_deg: tuple[float, ...] = (0.0,)
+    azimuth_errors_deg: tuple[float, ...] = (0.0,)
 
     @classmethod
     def parse(cls, name: str, value: YamlValue, start_ns: int) -> SimLidar:
@@ -89,7 +99,8 @@ class SimLidar(SimSensor):
     def check(self, room: Room | None, drive: Drive | None) -> None:
         if room is None:
             raise RigError(f"{self.name} needs a room; give the scenario one.")
-        for errors, what in ((self.elevation_errors_deg, "elevation errors"), (self.ring_offsets_m, "ring offsets")):
+        of_rings = {"elevation errors": self.elevation_errors_deg, "azimuth errors": self.azimuth_errors_deg}
+        for what, errors in (of_rings | {"ring offsets": self.ring_offsets_m}).items():
             if (n := len(errors)) not in (1, self.rings):
                 raise RigError(f"{self.name} has {self.rings} rings, but {n} {what}; give one for each ring.")
 
@@ -101,8 +112,8 @@ class SimLidar(SimSensor):
             bands = np.rint(np.linspace(0.0, N_RINGS - 1.0, self.rings)).astype(int)  # the mean of several rings
             mean_deg = np.bincount(bands, off_deg, N_RINGS) / np.maximum(np.bincount(bands, minlength=N_RINGS), 1)
             values[RING_ELEVATIONS.name] = np.deg2rad(mean_deg)
-        entries = {RING_OFFSETS.name: list(map(float, self.ring_offsets_m))} if any(self.ring_offsets_m) else {}
-        return TrueParameters(values, entries)
+        against = {RING_OFFSETS.name: self.ring_offsets_m, RING_AZIMUTHS.name: np.deg2rad(self.azimuth_errors_deg)}
+        return TrueParameters(values, {name: list(map(float, of)) for name, of in against.items() if any(of)})
 
     @property
     def points(self) -> int:
@@ -203,7 +214,7 @@ def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.n
     return _Turn(
         rotation @ lidar.T_imu_sensor[:3, :3],
         position + rotation @ lidar.T_imu_sensor[:3, 3],
-        _beams(lidar, np.array(lidar.elevation_errors_deg)),
+        _beams(lidar, np.array(lidar.elevation_errors_deg), np.array(lidar.azimuth_errors_deg)),
         firing,
         lidar.range_offset_m + np.array(lidar.ring_offsets_m) + noise,
         lidar.range_m,
@@ -212,9 +223,10 @@ def _turn(lidar: SimLidar, trajectory: TrueTrajectory, begin: float, noise: np.n
     )
 
 
-def _beams(lidar: SimLidar, off_deg: np.ndarray | float = 0.0) -> np.ndarray:
-    """(A, K, 3) unit directions in the LiDAR's frame. off_deg: added to the elevation of each ring."""
-    azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps
+def _beams(lidar: SimLidar, off_deg: np.ndarray | float = 0.0, turn_deg: np.ndarray | float = 0.0) -> np.ndarray:
+    """(A, K, 3) unit directions in the LiDAR's frame. off_deg, turn_deg: added to elevation and azimuth of each
+    ring."""
+    azimuth = 2.0 * np.pi * np.arange(lidar.azimuth_steps)[:, None] / lidar.azimuth_steps + np.deg2rad(turn_deg)
     elevation = np.deg2rad(np.linspace(*lidar.elevation_deg, lidar.rings) + off_deg)
     level, up = np.cos(elevation), np.sin(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up + 0.0 * azimuth], axis=2)

@@ -61,6 +61,7 @@ RING_ELEVATIONS = ParameterSpec(
     one="ring_elevation",
     is_auxiliary=True,
     is_effect=True,
+    largest=0.1,
     meaning="true less reported elevations of 16 bands of rings, the lowest first",
     motion="show walls and floor at all elevations",
 )
@@ -72,9 +73,17 @@ RING_OFFSETS = replace(
     unit="m",
     tolerance=RANGE_OFFSET.tolerance,
     prior_sigma=RANGE_OFFSET.prior_sigma,
+    largest=RANGE_OFFSET.largest,
     meaning="range offsets of 16 bands of rings against that with most points, the lowest first",
 )
-OF_RINGS = (RING_ELEVATIONS, RING_OFFSETS)
+# Of all rings together it is the rotation of the LiDAR about z: priors hold their mean at zero.
+RING_AZIMUTHS = replace(
+    RING_ELEVATIONS,
+    name="ring_azimuths",
+    one="ring_azimuth",
+    meaning="true less reported azimuths of 16 bands of rings, the lowest first",
+)
+OF_RINGS = (RING_ELEVATIONS, RING_OFFSETS, RING_AZIMUTHS)
 PointTime = Literal["auto", "start", "end", "azimuth", "snapshot"]
 _FIELDS = (
     "path", "topic", "range_noise", "min_range", "max_range", "point_time", "point_time_field", "point_time_unit",
@@ -110,6 +119,7 @@ class Lidar(MountedSensor):
     range_scale: Parameter = Parameter("fixed")
     ring_elevations: Parameter = Parameter("fixed")
     ring_offsets: Parameter = Parameter("fixed")
+    ring_azimuths: Parameter = Parameter("fixed")
 
     @classmethod
     def parse(cls, name: str, value: YamlValue) -> Lidar:

@@ -28,7 +28,7 @@ from icalib.rig import Lidar, ParameterSpec, Rig
 from icalib.sensors.lidar.assess.boards import on_boards, ranges_offset, sheet_notes, sheet_planes, wrong_sheets
 from icalib.sensors.lidar.binning import LidarNoise, in_world
 from icalib.sensors.lidar.patch_factor import PatchFactor
-from icalib.sensors.lidar.residual import LidarFactor, true_points
+from icalib.sensors.lidar.residual import RINGS_SEEN, LidarFactor, true_points
 from icalib.sensors.lidar.spec import OF_RINGS, RANGE_OFFSET, RANGE_SCALE
 from icalib.sensors.lidar.stream import LidarResiduals
 
@@ -110,10 +110,11 @@ def ring_notes(a: AssessedEstimate) -> Iterator[Remark]:
     specs = {spec.name: spec for spec in OF_RINGS}
     for g in a.groups:
         if g.name in specs and g.columns is not None and (abs(g.value) > EFFECT_SIGMAS * g.std).any():
+            low, high = np.rad2deg(a.estimate.outcome.state.values[g.sensor, RINGS_SEEN][:2])
             yield Remark(
                 "ring_errors_estimated",
                 f"{_rings_off(g.sensor, specs[g.name], g.value, g.std)}, which the estimate includes; correct points "
-                f"by {g.name} of the result where you use them, too.",
+                f"by {g.name} of the result where you use them, too: 16 bands evenly from {low:.2f} to {high:.2f} deg.",
             )
 
 
