@@ -453,14 +453,11 @@ class Effect:
 
     @property
     def prior_sigma(self) -> float:
-        """Standard deviation of the prior with which it is estimated: the usual one, or of a single number the next
-        power of ten. Priors alone may hold the mean of several."""
-        usual_sigma = self.spec.prior_sigma
-        return (
-            usual_sigma
-            if len(self.value) > 1
-            else max(10.0 ** float(np.ceil(np.log10(abs(self.value[0])))), usual_sigma)
-        )
+        """Standard deviation of the prior with which it is estimated: the usual one, or a larger one that the value
+        does not contradict. Of several numbers it is half the largest, as it may be all that holds their mean."""
+        largest = float(np.abs(self.value).max())
+        needed = 0.5 * largest if len(self.value) > 1 else 10.0 ** np.ceil(np.log10(largest))
+        return max(float(needed), self.spec.prior_sigma)
 
 
 class EffectsLeftOut(NamedTuple):
