@@ -199,8 +199,13 @@ class CornerFactor(FactorDefaults):
 
     def row_poses(self, state: State, image: np.ndarray, phase: np.ndarray, jacobians: bool = False) -> SensorPose:
         """Camera poses (n,) in images image (n,), increasing, at the times of rows with `Shutter.phase` phase (n,)."""
-        seconds, keyframe = self.times[image] + state.values[self.name, "readout"] * phase, self.keyframe[image]
-        at = SensorPose.at(self.kinematics, seconds, keyframe, state, jacobians)
+        readout, keyframe = float(state.values[self.name, "readout"][0]), self.keyframe[image]
+        seconds = self.times[image] + readout * phase
+        if readout == 0.0:  # as where it is tested: rows of an image share a pose
+            own, of_row = np.unique(image, return_inverse=True)
+            at = SensorPose.at(self.kinematics, self.times[own], self.keyframe[own], state, jacobians).part(of_row)
+        else:
+            at = SensorPose.at(self.kinematics, seconds, keyframe, state, jacobians)
         if self.slopes is None or jacobians:
             return at
         instant = seconds + offset_at(state, self.name, keyframe, seconds)
