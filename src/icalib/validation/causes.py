@@ -25,7 +25,7 @@ from icalib.result import CrossValidation, SensorFit
 from icalib.result.calibration import Timeline
 from icalib.result.quantities import FAR_BEYOND, dof_known, excess, is_small, ratio, times
 from icalib.result.verdict import AUXILIARY
-from icalib.rig import ImuSensor, Rig
+from icalib.rig import ImuSensor, Rig, Sensor
 from icalib.sensors.imu.assess import quiet_scatter
 from icalib.sensors.imu.spec import ACCEL_DELAY
 from icalib.sensors.sensor import CLOCK_RATE, TIME_OFFSET
@@ -68,7 +68,13 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
 
 def _may_change(inputs: Inputs) -> set[Key]:
     """Groups of parameters that may change during a recording."""
-    return {(s.name, name) for s in inputs.sensors for names in s.may_change for name in names}
+    return {key for s in inputs.sensors for names in s.may_change for key in _changes_with(s, names[0])}
+
+
+def _changes_with(sensor: Sensor, name: str) -> set[Key]:
+    """Groups that change with one of these: those of a mount, or of a lens."""
+    together = {n for names in sensor.may_change if name in names for n in names}
+    return {(sensor.name, n) for n in together | set(sensor.lens if name in sensor.lens else ())}
 
 
 def _stated(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> tuple[list[Cause], tuple[Remark, ...]]:
@@ -236,8 +242,8 @@ def _change(tried: Changes, assessed: AssessedEstimate, misfit: Misfit) -> Itera
         words = _change_words(alike, assessed)
         share = min(best.gain / tried.scatter.beyond_chance, 1.0)
         words = words.with_sentence(f"{words} This explains {share:.0%} of what varies over the recording.")
-        keys = tuple((sensor, c.name) for c in alike for sensor in c.sensors)
-        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, assessed.beside[0]), keys)
+        changed = {key for c in alike for s in c.sensors for key in _changes_with(assessed.inputs.sensor(s), c.name)}
+        yield Cause(words, best.gain, misfit.is_grave or _is_large(best, assessed.beside[0]), tuple(changed))
 
 
 def _is_large(c: Change, problem: Problem) -> bool:

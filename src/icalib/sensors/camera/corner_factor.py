@@ -202,8 +202,10 @@ class CornerFactor(FactorDefaults):
         readout, keyframe = float(state.values[self.name, "readout"][0]), self.keyframe[image]
         seconds = self.times[image] + readout * phase
         if readout == 0.0:  # as where it is tested: rows of an image share a pose
-            own, of_row = np.unique(image, return_inverse=True)
-            at = SensorPose.at(self.kinematics, self.times[own], self.keyframe[own], state, jacobians).part(of_row)
+            images, of_row = np.unique(image, return_inverse=True)
+            at = SensorPose.at(self.kinematics, self.times[images], self.keyframe[images], state, jacobians).part(
+                of_row
+            )
         else:
             at = SensorPose.at(self.kinematics, seconds, keyframe, state, jacobians)
         if self.slopes is None or jacobians:
