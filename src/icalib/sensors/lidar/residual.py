@@ -75,8 +75,9 @@ def rings_seen(stream: LidarStream, state: State | None = None) -> np.ndarray:
     if state is not None and (stream.name, RINGS_SEEN) in state.values:
         return state.values[stream.name, RINGS_SEEN]
     some = elevations(stream.xyz[:: len(stream.xyz) // ENOUGH_POINTS | 1])
-    ends = np.quantile(some, [FEW_POINTS, 1.0 - FEW_POINTS])
-    return np.append(ends, np.bincount(_bands(some, *ends)).argmax())
+    some = some[np.isfinite(some)]
+    ends = np.quantile(some, [FEW_POINTS, 1.0 - FEW_POINTS]) if len(some) else np.zeros(2)
+    return np.append(ends, np.bincount(_bands(some, *ends), minlength=N_RINGS).argmax())
 
 
 def rings_of(stream: LidarStream, state: State) -> np.ndarray:
@@ -87,7 +88,7 @@ def rings_of(stream: LidarStream, state: State) -> np.ndarray:
 
 def _bands(elevation: np.ndarray, low: float, high: float) -> np.ndarray:
     per_band = (N_RINGS - 1) / max(high - low, 1e-9)  # a LiDAR of one ring has one band
-    return np.clip(np.rint((elevation - low) * per_band), 0, N_RINGS - 1).astype(np.uint8)
+    return np.clip(np.rint(np.nan_to_num(elevation - low) * per_band), 0, N_RINGS - 1).astype(np.uint8)
 
 
 def ring_errors(state: State, lidar: str) -> np.ndarray:
