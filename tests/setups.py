@@ -355,7 +355,7 @@ def make_room(
 ) -> RoomSetup:
     """Of the first LiDAR; the planes' points are the means of the faces that the points were seen on. sheet: the floor
     is the sheet of a target at the origin of the world; drifts: the rate of the clock is estimated; rings: the
-    elevations of its rings are."""
+    errors of its rings are."""
     truth, stream = sim.truth, sim.measurements.lidars[0]
     imu = ImuData.build(not_none(sim.measurements.imu), sim.scenario.imu_noise)
     count = np.bincount(stream.plane[stream.plane >= 0], minlength=len(truth.planes))

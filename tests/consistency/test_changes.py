@@ -22,8 +22,8 @@ from tests.cases import each
 def test_what_changes_is_named(benchmark_program, rig: str, effect: str, size: float, expected: str) -> None:
     """The instant is inside of a segment of the recording, and in the middle of tracks."""
     program = benchmark_program("effects")
-    kind = program.KINDS[rig]
+    kind = replace(program.KINDS[rig], instant_s=5.37)
     base = kind.scenario()
-    changed = next(e for e in program.outside(base, replace(kind, instant_s=5.37)) if e.name == effect)
-    named = program.cell(replace(kind, instant_s=5.37), base, changed, size, 2).named
+    changed = next(e for e in program.outside(base, kind) if e.name == effect)
+    named = program.cell(kind, base, changed, size, 2).named
     assert re.search(rf"^\w+: .*{expected}", named) and re.search(r"near 5\.\d+ s", named), named

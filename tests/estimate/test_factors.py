@@ -411,8 +411,8 @@ def lidar_sample(
     rings=False,
 ):
     """Its moments taken at another state, as in all but the first linearisation of a pass. noisy: how much more than
-    that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target. rings: the elevations of
-    rings are free."""
+    that of the data sheet the gyroscope's noise is. sheet: the floor is the sheet of a target. rings: errors of rings
+    are free."""
     setup = room_of(room, imu_free=imu_free, spacing=0.05, sheet=sheet, drifts=True, rings=rings)
     setup = replace(setup, imu=replace(setup.imu, variance=noisy**2 * setup.imu.variance))
     if restarts:

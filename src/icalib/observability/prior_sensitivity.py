@@ -592,11 +592,14 @@ class _FreedEstimate:
         return -(self._root @ (self._root.T @ self.solution.information[:, columns]))[self._estimated]
 
     def _scatter(self, step: np.ndarray, root: np.ndarray, freed: Inputs) -> np.ndarray | None:
-        """(B,) ratios of standard deviations, by the scatter of segments after `step` and by white noise; at least that
-        of all parameters that matter together. None without segments."""
-        if (before := self._segments(step, 0.0, freed)) is None:
+        """(B,) ratios of standard deviations, by the scatter of segments after `step`, which trajectory and points
+        follow, and by white noise; at least that of all parameters that matter together. None without segments."""
+        if (before := self._segments(self.state, freed)) is None:
             return None
-        shortly = self._segments(step, SHORTLY, freed) or before
+        factors = self.solution.factors
+        chain = factors.back(np.append(step, 1.0)[:, None], [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
+        moved = self.state.retract(self.problem.layout, SHORTLY * chain, SHORTLY * step)
+        shortly = self._segments(moved, freed) or before
         gradients = before.gradients + (shortly.gradients - before.gradients) / SHORTLY
         outcome = self._outcome(self.state)
         white = noise_variance(self.problem, outcome)
@@ -606,11 +609,8 @@ class _FreedEstimate:
         ratio = np.sqrt(np.maximum(ratio, 1.0))
         return np.maximum(ratio, np.sqrt(np.mean(ratio[calibration_columns(freed)] ** 2)))
 
-    def _segments(self, step: np.ndarray, share: float, freed: Inputs) -> Segments | None:
-        """Segments after a share of `step`, which trajectory and points follow."""
-        factors = self.solution.factors
-        chain = factors.back(np.append(step, 1.0)[:, None], [np.zeros((n, 1)) for n in factors.rows()])[:, :, 0]
-        state = self.state.retract(self.problem.layout, share * chain, share * step)
+    def _segments(self, state: State, freed: Inputs) -> Segments | None:
+        """Segments at another state."""
         return Segments.of(self.problem, self._outcome(state), freed.rig.settings.segments)
 
     def _outcome(self, state: State) -> Outcome:

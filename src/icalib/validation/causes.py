@@ -56,12 +56,12 @@ def all_causes(assessed: AssessedEstimate, against: Sequence[Contradiction]) -> 
     fits = [f for f in assessed.fits if (not against or f.kind in IMAGE_KINDS) and f.kind not in omitted]
     misfit = Misfit.of(fits)
     known, drifts = stated, any(e.spec is CLOCK_RATE and e.differs for e in assessed.effects)
-    values = [c for c in stated if c.remedy is None]  # that are wrong; each may be the mean of one that changes
-    mean = {key for c in values for key in c.explains} & _may_change(assessed.inputs)
+    # A wrong value has no remedy, and may be the mean of one that changes.
+    mean = {key for c in stated if c.remedy is None for key in c.explains} & _may_change(assessed.inputs)
     if not against and (drifts or mean or not any_explains([c for c in stated if c.gain < np.inf], misfit)):
         varying = list(varying_causes(assessed, misfit))
         changed = {key for c in varying for key in c.explains}
-        known = [*varying, *(c for c in stated if c not in values or not changed.intersection(c.explains))]
+        known = [*varying, *(c for c in stated if c.remedy is not None or changed.isdisjoint(c.explains))]
     both = ranked([*known, *misfit_causes(replace(assessed, fits=fits), misfit, any_explains(known, misfit))])
     return [*(c for c in both if c.grave), *(c for c in both if not c.grave)], notes
 

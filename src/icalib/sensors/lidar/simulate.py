@@ -49,6 +49,10 @@ MAX_OFFSET_M = 0.5  # of ranges; that of real LiDARs is some centimetres
 _FLOAT32 = 7  # datatype of sensor_msgs/PointField
 
 
+def _numbers(value: YamlValue) -> tuple[float, ...]:
+    return tuple(x.number() for x in value.items())
+
+
 @dataclass(frozen=True, eq=False)
 class SimLidar(SimSensor):
     """True parameters of one LiDAR that spins counterclockwise about its z axis.
@@ -67,8 +71,8 @@ class SimLidar(SimSensor):
         RANGE_SCALE.name: ("scale", true_ratio),
         RANGE_OFFSET.name: ("range_offset_m", lambda value: limited(value, MAX_OFFSET_M)),
         RING_OFFSETS.name: ("ring_offsets_m", lambda value: tuple(limited(x, MAX_OFFSET_M) for x in value.items())),
-        RING_ELEVATIONS.name: ("elevation_errors_deg", lambda value: tuple(x.number() for x in value.items())),
-        RING_AZIMUTHS.name: ("azimuth_errors_deg", lambda value: tuple(x.number() for x in value.items())),
+        RING_ELEVATIONS.name: ("elevation_errors_deg", _numbers),
+        RING_AZIMUTHS.name: ("azimuth_errors_deg", _numbers),
     }
 
     rate_hz: float = 8.0

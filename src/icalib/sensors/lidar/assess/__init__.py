@@ -97,7 +97,7 @@ def range_notes(a: AssessedEstimate) -> Iterator[Remark]:
 
 
 def ring_causes(a: AssessedEstimate) -> Iterator[Cause]:
-    """A cause for each LiDAR whose rings have other elevations or offsets than it reports."""
+    """A cause for each LiDAR whose rings have other elevations, offsets or azimuths than it reports."""
     for e in a.effects:
         if e.spec in OF_RINGS and e.differs:
             off, advice = _rings_off(e.sensor, e.spec, e.value, e.std), f"Write {e.spec.name}: free for {e.sensor}."
@@ -106,7 +106,7 @@ def ring_causes(a: AssessedEstimate) -> Iterator[Cause]:
 
 
 def ring_notes(a: AssessedEstimate) -> Iterator[Remark]:
-    """Notes on each LiDAR whose rings have elevations or offsets of their own in the result."""
+    """Notes on each LiDAR whose rings have errors of their own in the result."""
     specs = {spec.name: spec for spec in OF_RINGS}
     for g in a.groups:
         if g.name in specs and g.columns is not None and (abs(g.value) > EFFECT_SIGMAS * g.std).any():
